@@ -1,0 +1,142 @@
+"""What an estimator says of one view, and what fusion says of the scene: struct-of-arrays tables."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """k pose hypotheses of one view.
+
+    Attributes:
+        T_camera_object: (k, 4, 4) poses in the optical frame, metres.
+        score: (k,) the estimator's own confidence in [0, 1]; ranks hypotheses.
+        box: (k, 4) x_min, y_min, x_max, y_max of the mask over image width and height, in [0, 1] (paper: b).
+        depth: (k,) mean depth over the mask in metres (paper: d).
+        label: (k,) uint16, the hypothesis's value in ``segmentation``, from 1; several hypotheses may share a label
+            when they are alternatives for one instance.
+        segmentation: (H, W) uint16 label per pixel, 0 for background.
+
+    Raises:
+        ValueError: array shapes disagree.
+    """
+
+    T_camera_object: np.ndarray
+    score: np.ndarray
+    box: np.ndarray
+    depth: np.ndarray
+    label: np.ndarray
+    segmentation: np.ndarray
+
+    def __post_init__(self) -> None:
+        k = len(self.score)
+        expected = {"T_camera_object": (k, 4, 4), "score": (k,), "box": (k, 4), "depth": (k,), "label": (k,)}
+        for name, shape in expected.items():
+            actual = np.shape(getattr(self, name))
+            if actual != shape:
+                raise ValueError(f"hypotheses: {name} has shape {actual}, expected {shape}")
+        if np.ndim(self.segmentation) != 2:
+            raise ValueError(f"hypotheses: segmentation must be (H, W), got {np.shape(self.segmentation)}")
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    @classmethod
+    def from_masks(
+        cls,
+        T_camera_object: np.ndarray,
+        score: np.ndarray,
+        label: np.ndarray,
+        segmentation: np.ndarray,
+        depth_image: np.ndarray,
+    ) -> "Hypotheses":
+        """Build the table; boxes and mean depths are measured from the masks (paper, "Objects feature representation").
+
+        Args:
+            T_camera_object: (k, 4, 4).
+            score: (k,).
+            label: (k,) labels that occur in ``segmentation``.
+            segmentation: (H, W) uint16.
+            depth_image: (H, W) metres, NaN invalid; a mask without valid depth gets the pose's own z.
+
+        Raises:
+            ValueError: a label has no pixel.
+        """
+        height, width = segmentation.shape
+        label = np.asarray(label, np.uint16)
+        flat = segmentation.ravel()
+        members = np.flatnonzero(flat)
+        labels_of_members = flat[members].astype(np.intp)
+        size = int(max(labels_of_members.max(initial=0), label.max(initial=0))) + 1
+        rows, columns = np.divmod(members, width)
+        low = np.full((size, 2), np.inf)
+        high = np.full((size, 2), -np.inf)
+        for axis, coordinate in enumerate((columns, rows)):
+            np.minimum.at(low[:, axis], labels_of_members, coordinate)
+            np.maximum.at(high[:, axis], labels_of_members, coordinate + 1)
+        if not np.isfinite(low[label]).all():
+            raise ValueError("hypotheses: a label has no pixel in the segmentation")
+        z = depth_image.ravel()[members]
+        valid = np.isfinite(z)
+        count = np.bincount(labels_of_members[valid], minlength=size)[label]
+        total = np.bincount(labels_of_members[valid], weights=z[valid], minlength=size)[label]
+        depth = np.where(count > 0, total / np.maximum(count, 1), T_camera_object[:, 2, 3])
+        box = np.concatenate([low[label], high[label]], axis=1) / (width, height, width, height)
+        return cls(np.asarray(T_camera_object, float), np.asarray(score, float), box, depth, label, segmentation)
+
+    @classmethod
+    def empty(cls, height: int, width: int) -> "Hypotheses":
+        """No hypothesis, for an image of the given size in pixels."""
+        none = np.zeros(0)
+        return cls(
+            np.zeros((0, 4, 4)), none, np.zeros((0, 4)), none, none.astype(np.uint16), np.zeros((height, width), np.uint16)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObjects:
+    """n accumulated objects in the world (the paper's selected hypotheses and their features B_t).
+
+    Attributes:
+        T_world_object: (n, 4, 4) poses in the world, metres.
+        verification: (n,) verification score c of the surviving hypothesis, from the view it was seen in (equation 1).
+        score: (n,) the estimator's confidence of the surviving hypothesis.
+        box: (n, 4) normalised box in the current camera (paper: b), re-projected for objects not seen in this view.
+        depth: (n,) metres along z in the current camera (paper: d).
+        support: (n,) int, number of views with a hypothesis in the object's cluster.
+        spread: (n,) metres, how far apart the cluster's hypotheses place the model's points (0 with one hypothesis).
+    """
+
+    T_world_object: np.ndarray
+    verification: np.ndarray
+    score: np.ndarray
+    box: np.ndarray
+    depth: np.ndarray
+    support: np.ndarray
+    spread: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.verification)
+        for item in fields(self):
+            shape = np.shape(getattr(self, item.name))
+            expected = {"T_world_object": (n, 4, 4), "box": (n, 4)}.get(item.name, (n,))
+            if shape != expected:
+                raise ValueError(f"scene objects: {item.name} has shape {shape}, expected {expected}")
+
+    def __len__(self) -> int:
+        return len(self.verification)
+
+    @classmethod
+    def empty(cls) -> "SceneObjects":
+        """No object."""
+        none = np.zeros(0)
+        return cls(np.zeros((0, 4, 4)), none, none, np.zeros((0, 4)), none, np.zeros(0, int), none)
+
+    def features(self) -> np.ndarray:
+        """(n, 6) box, depth and verification score: the tuple (b, d, c) of the paper's attention module."""
+        return np.concatenate([self.box, self.depth[:, None], self.verification[:, None]], axis=1)
+
+    def take(self, index: np.ndarray) -> "SceneObjects":
+        """The objects at ``index`` (integers or a mask), in that order."""
+        return replace(self, **{item.name: getattr(self, item.name)[index] for item in fields(self)})

@@ -1,0 +1,174 @@
+"""Object models: one YAML description a file, with its mesh, instance range and symmetries.
+
+Descriptions are found by name in the folders of ``ACTIVE6D_OBJECT_PATH`` (separated as in ``PATH``), then among those
+shipped with this package, so adding an object is adding a file. ``objects/README.md`` explains every key.
+"""
+
+import os
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import yaml
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+SHIPPED_OBJECTS = Path(__file__).parent / "objects"
+_REQUIRED = {"name", "instances", "color"}
+_OPTIONAL = {"mesh", "profile", "scale", "symmetry", "features", "source"}
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """Rotations about the object's origin that leave it looking the same.
+
+    Attributes:
+        axis: (3,) unit axis of a continuous symmetry, None without one.
+        discrete: (s, 3, 3) proper rotations of a finite symmetry group, the identity among them.
+    """
+
+    axis: np.ndarray | None
+    discrete: np.ndarray
+
+    def rotations(self, step_degrees: float = 1.0) -> np.ndarray:
+        """(s, 3, 3) the whole group, a continuous axis sampled every ``step_degrees`` (BOP's convention)."""
+        if self.axis is None:
+            return self.discrete
+        angles = np.radians(np.arange(0.0, 360.0, step_degrees))
+        about_axis = Rotation.from_rotvec(angles[:, None] * self.axis).as_matrix()
+        return (about_axis[:, None] @ self.discrete[None]).reshape(-1, 3, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """A rigid object. The mesh's frame is the object's frame; its origin is the volume's centroid, units are metres.
+
+    Attributes:
+        name: of the description file, without ``.yaml``.
+        mesh: triangle mesh in the object frame.
+        diameter: largest distance between two vertices, metres.
+        symmetry: of shape and colour together.
+        instances: fewest and most instances in a scene.
+        color: (3,) RGB in [0, 1].
+        features: name to (2, 3) axis-aligned box (min, max) in the object frame, naming a part of the surface
+            (the mug's ``handle``) whose visibility decides whether the pose is ambiguous.
+    """
+
+    name: str
+    mesh: trimesh.Trimesh
+    diameter: float
+    symmetry: Symmetry
+    instances: tuple[int, int]
+    color: np.ndarray
+    features: dict[str, np.ndarray]
+
+    @cached_property
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """(8192, 3) points spread evenly over the surface, and their (8192, 3) outward unit normals. Seeded."""
+        points, faces = trimesh.sample.sample_surface(self.mesh, 8192, seed=0)
+        return np.asarray(points), np.asarray(self.mesh.face_normals[faces])
+
+    @cached_property
+    def error_points(self) -> np.ndarray:
+        """(n, 3) the model points that pose errors average over: the mesh's vertices, or 2000 surface points if fewer."""
+        vertices = np.asarray(self.mesh.vertices)
+        return vertices if len(vertices) >= 2000 else self.surface[0][:2000]
+
+    def feature_mask(self, feature: str, points: np.ndarray) -> np.ndarray:
+        """Which of (n, 3) ``points`` in the object frame belong to the named part: (n,) bool."""
+        low, high = self.features[feature]
+        return ((points >= low) & (points <= high)).all(axis=-1)
+
+
+def list_objects() -> list[str]:
+    """Names of all objects that :func:`load_object` finds."""
+    return sorted({path.stem for folder in _search_folders() for path in folder.glob("*.yaml")})
+
+
+@lru_cache(maxsize=16)
+def load_object(name: str) -> ObjectModel:
+    """Load an object by name.
+
+    Raises:
+        ValueError: no such object, or its description is wrong; the message names the file and the key.
+    """
+    for folder in _search_folders():
+        path = folder / f"{name}.yaml"
+        if path.is_file():
+            return read_description(path)
+    raise ValueError(f"unknown object '{name}'; known: {', '.join(list_objects())} (ACTIVE6D_OBJECT_PATH adds folders)")
+
+
+def read_description(path: Path) -> ObjectModel:
+    """Read one description file and the mesh that it names.
+
+    Raises:
+        ValueError: the description or the mesh is wrong; the message names the file and the key.
+    """
+    description = yaml.safe_load(path.read_text())
+    if not isinstance(description, dict):
+        raise ValueError(f"{path}: not a mapping of keys")
+    missing, unknown = _REQUIRED - description.keys(), description.keys() - _REQUIRED - _OPTIONAL
+    if missing or unknown:
+        raise ValueError(f"{path}: missing keys {sorted(missing)}, unknown keys {sorted(unknown)}")
+    if description["name"] != path.stem:
+        raise ValueError(f"{path}: name '{description['name']}' differs from the file's")
+    try:
+        mesh = _load_mesh(description, path)
+        low, high = (int(count) for count in description["instances"])
+        color = np.array(description["color"], float)
+        if not (1 <= low <= high) or color.shape != (3,):
+            raise ValueError("instances needs [fewest, most] from 1, color needs [r, g, b]")
+        return ObjectModel(
+            name=path.stem,
+            mesh=mesh,
+            diameter=_diameter(mesh),
+            symmetry=_read_symmetry(description.get("symmetry") or {}),
+            instances=(low, high),
+            color=color,
+            features={key: np.array(box, float).reshape(2, 3) for key, box in (description.get("features") or {}).items()},
+        )
+    except (TypeError, KeyError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _search_folders() -> list[Path]:
+    extra = os.environ.get("ACTIVE6D_OBJECT_PATH", "")
+    return [Path(folder) for folder in extra.split(os.pathsep) if folder] + [SHIPPED_OBJECTS]
+
+
+def _load_mesh(description: dict, path: Path) -> trimesh.Trimesh:
+    """The mesh of ``mesh`` (a file) or ``profile`` ((r, z) rows revolved about z), scaled, origin at its centroid."""
+    if ("mesh" in description) == ("profile" in description):
+        raise ValueError("needs either mesh (a file) or profile (rows of radius and height)")
+    if "profile" in description:
+        mesh = trimesh.creation.revolve(np.array(description["profile"], float), sections=96)
+    else:
+        mesh_path = path.parent / description["mesh"]
+        if not mesh_path.is_file():
+            raise ValueError(f"mesh {mesh_path} does not exist")
+        mesh = trimesh.load_mesh(mesh_path)
+    mesh.apply_scale(float(description.get("scale", 1.0)))
+    if not len(mesh.faces) or mesh.volume <= 0:
+        raise ValueError("mesh has no faces, or its faces point inwards (negative volume)")
+    # With the origin at the mass centre, physics needs no inertial offset and rotation errors do not leak into ADD.
+    mesh.apply_translation(-mesh.center_mass)
+    return mesh
+
+
+def _diameter(mesh: trimesh.Trimesh) -> float:
+    return float(pdist(np.asarray(mesh.convex_hull.vertices)).max())
+
+
+def _read_symmetry(description: dict) -> Symmetry:
+    axis = description.get("axis")
+    if axis is not None:
+        axis = np.array(axis, float)
+        if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
+            raise ValueError("symmetry.axis needs three numbers, not all zero")
+        axis = axis / np.linalg.norm(axis)
+    rotation_vectors = np.array(description.get("discrete_rotvec_degrees") or np.zeros((0, 3)), float).reshape(-1, 3)
+    generated = Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix() if len(rotation_vectors) else np.zeros((0, 3, 3))
+    return Symmetry(axis, np.concatenate([np.eye(3)[None], generated]))
