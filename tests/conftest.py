@@ -1,0 +1,26 @@
+"""What all tests share: the packages on the path, ROS kept to this machine, and the graph harness."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent
+SOURCES = sorted(str(path) for path in (TESTS.parent / "src").glob("active6d_*"))
+sys.path[:0] = [str(TESTS), *(path for path in SOURCES if path not in sys.path)]
+# Child processes (nodes under `--processes`, the command) import the same sources.
+os.environ["PYTHONPATH"] = os.pathsep.join([*SOURCES, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+# Must be set before the first rclpy import.
+os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+@pytest.fixture
+def graph():
+    """A fresh :class:`ros_harness.GraphHarness`, closed after the test."""
+    from ros_harness import GraphHarness
+
+    harness = GraphHarness()
+    yield harness
+    harness.close()
