@@ -90,7 +90,12 @@ class Hypotheses:
         """No hypothesis, for an image of the given size in pixels."""
         none = np.zeros(0)
         return cls(
-            np.zeros((0, 4, 4)), none, np.zeros((0, 4)), none, none.astype(np.uint16), np.zeros((height, width), np.uint16)
+            np.zeros((0, 4, 4)),
+            none,
+            np.zeros((0, 4)),
+            none,
+            none.astype(np.uint16),
+            np.zeros((height, width), np.uint16),
         )
 
 

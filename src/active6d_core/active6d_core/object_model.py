@@ -128,7 +128,9 @@ def read_description(path: Path) -> ObjectModel:
             symmetry=_read_symmetry(description.get("symmetry") or {}),
             instances=(low, high),
             color=color,
-            features={key: np.array(box, float).reshape(2, 3) for key, box in (description.get("features") or {}).items()},
+            features={
+                key: np.array(box, float).reshape(2, 3) for key, box in (description.get("features") or {}).items()
+            },
         )
     except (TypeError, KeyError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
@@ -170,5 +172,7 @@ def _read_symmetry(description: dict) -> Symmetry:
             raise ValueError("symmetry.axis needs three numbers, not all zero")
         axis = axis / np.linalg.norm(axis)
     rotation_vectors = np.array(description.get("discrete_rotvec_degrees") or np.zeros((0, 3)), float).reshape(-1, 3)
-    generated = Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix() if len(rotation_vectors) else np.zeros((0, 3, 3))
+    generated = (
+        Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix() if len(rotation_vectors) else np.zeros((0, 3, 3))
+    )
     return Symmetry(axis, np.concatenate([np.eye(3)[None], generated]))

@@ -1,0 +1,403 @@
+"""ROS messages to the core's types and back; the only module of the core that knows messages.
+
+Everything that comes in is checked here (sizes, encodings, frames, numbers, quaternions) and refused with a
+:class:`MessageError` that says what is wrong. The readers need only the fields of a message, so they also read the
+message objects that rosbags deserialises.
+"""
+
+import array
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from active6d_core.camera import PinholeCamera
+from active6d_core.hypotheses import Hypotheses, SceneObjects
+from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
+
+_POSE_COLUMNS = {name: "<f4" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")}
+_BOX_COLUMNS = {name: "<f4" for name in ("box_x_min", "box_y_min", "box_x_max", "box_y_max")}
+HYPOTHESIS_COLUMNS = {**_POSE_COLUMNS, "score": "<f4", **_BOX_COLUMNS, "depth": "<f4", "label": "<u2"}
+OBJECT_COLUMNS = {
+    **_POSE_COLUMNS,
+    "verification": "<f4",
+    "score": "<f4",
+    **_BOX_COLUMNS,
+    "depth": "<f4",
+    "support": "<u2",
+    "spread": "<f4",
+}
+ATTENTION_COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4", "weight": "<f4", "attended": "|u1"}
+
+_DATATYPES = {"<f4": PointField.FLOAT32, "<u2": PointField.UINT16, "|u1": PointField.UINT8}
+_COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
+#: A quaternion whose norm is further from one than this was not meant as a rotation.
+_QUATERNION_TOLERANCE = 1e-2
+
+
+class MessageError(ValueError):
+    """A message that cannot be used; the text says which field and why."""
+
+
+def stamp_to_ns(stamp: Time) -> int:
+    """A message's stamp in nanoseconds."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def ns_to_stamp(nanoseconds: int) -> Time:
+    """Nanoseconds to a message's stamp."""
+    return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
+
+
+def make_header(stamp: int, frame: str) -> Header:
+    """Header with a stamp in nanoseconds."""
+    return Header(stamp=ns_to_stamp(stamp), frame_id=frame)
+
+
+def require_frame(header: Header, frame: str) -> None:
+    """Raise :class:`MessageError` unless the header names ``frame``."""
+    if header.frame_id != frame:
+        raise MessageError(f"frame_id is '{header.frame_id}', expected '{frame}'")
+
+
+# Poses
+
+
+def pose_to_transform(pose: Pose) -> np.ndarray:
+    """A Pose to (4, 4).
+
+    Raises:
+        MessageError: a number is not finite, or the quaternion is not of unit length.
+    """
+    p, q = pose.position, pose.orientation
+    return _rows_to_transforms(np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w]]))[0]
+
+
+def transform_to_pose(T: np.ndarray) -> Pose:
+    """(4, 4) to a Pose."""
+    x, y, z = (float(value) for value in T[:3, 3])
+    qx, qy, qz, qw = (float(value) for value in quaternion_from_transform(T))
+    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def pose_stamped_to_transform(message: PoseStamped, frame: str) -> np.ndarray:
+    """A PoseStamped in ``frame`` to (4, 4).
+
+    Raises:
+        MessageError: another frame, or a bad pose.
+    """
+    require_frame(message.header, frame)
+    return pose_to_transform(message.pose)
+
+
+def transform_to_pose_stamped(T: np.ndarray, stamp: int, frame: str) -> PoseStamped:
+    """(4, 4) to a PoseStamped in ``frame``."""
+    return PoseStamped(header=make_header(stamp, frame), pose=transform_to_pose(T))
+
+
+def poses_to_array(T: np.ndarray, stamp: int, frame: str) -> PoseArray:
+    """(n, 4, 4) to a PoseArray."""
+    return PoseArray(header=make_header(stamp, frame), poses=[transform_to_pose(pose) for pose in T])
+
+
+def poses_from_array(message: PoseArray, frame: str) -> np.ndarray:
+    """A PoseArray in ``frame`` to (n, 4, 4).
+
+    Raises:
+        MessageError: another frame, or a bad pose.
+    """
+    require_frame(message.header, frame)
+    return np.array([pose_to_transform(pose) for pose in message.poses]).reshape(-1, 4, 4)
+
+
+def _rows_to_transforms(rows: np.ndarray) -> np.ndarray:
+    """(n, 7) position and xyzw quaternion rows to (n, 4, 4), checked."""
+    if not np.isfinite(rows).all():
+        raise MessageError("a pose holds a number that is not finite")
+    norm = np.linalg.norm(rows[:, 3:], axis=1)
+    if (np.abs(norm - 1.0) > _QUATERNION_TOLERANCE).any():
+        raise MessageError(f"a quaternion has length {norm[np.argmax(np.abs(norm - 1.0))]:.3g}, expected 1")
+    return transform_from_quaternion(rows[:, 3:], rows[:, :3])
+
+
+# Images
+
+
+def color_to_image(color: np.ndarray, stamp: int, frame: str) -> Image:
+    """(H, W, 3) uint8 RGB to an ``rgb8`` Image."""
+    return _array_to_image(color, "rgb8", stamp, frame)
+
+
+def image_to_color(message: Image) -> np.ndarray:
+    """An 8-bit RGB, BGR, RGBA or BGRA Image to (H, W, 3) uint8 RGB.
+
+    Raises:
+        MessageError: another encoding, or sizes that disagree.
+    """
+    channels = _COLOR_CHANNELS.get(message.encoding)
+    if channels is None:
+        raise MessageError(f"color encoding '{message.encoding}' is not one of {', '.join(_COLOR_CHANNELS)}")
+    pixels = _image_to_array(message, np.dtype("u1"), 4 if message.encoding.endswith("a8") else 3)
+    return pixels if message.encoding == "rgb8" else np.ascontiguousarray(pixels[..., channels])
+
+
+def depth_to_image(depth: np.ndarray, stamp: int, frame: str) -> Image:
+    """(H, W) metres to a ``32FC1`` Image (REP-118)."""
+    return _array_to_image(depth.astype("<f4", copy=False), "32FC1", stamp, frame)
+
+
+def image_to_depth(message: Image) -> np.ndarray:
+    """A ``32FC1`` (metres) or ``16UC1`` (millimetres) Image to (H, W) float32 metres, NaN where not positive and finite.
+
+    Raises:
+        MessageError: another encoding, or sizes that disagree.
+    """
+    if message.encoding == "32FC1":
+        depth = _image_to_array(message, np.dtype("<f4"), 1)
+        valid = (depth > 0) & (depth < np.inf)
+        return depth if valid.all() else np.where(valid, depth, np.float32(np.nan))
+    if message.encoding == "16UC1":
+        millimetres = _image_to_array(message, np.dtype("<u2"), 1)
+        return np.where(millimetres > 0, millimetres * np.float32(0.001), np.float32(np.nan))
+    raise MessageError(f"depth encoding '{message.encoding}' is not 32FC1 or 16UC1")
+
+
+def segmentation_to_image(segmentation: np.ndarray, stamp: int, frame: str) -> Image:
+    """(H, W) uint16 labels to a ``mono16`` Image."""
+    return _array_to_image(segmentation.astype("<u2", copy=False), "mono16", stamp, frame)
+
+
+def image_to_segmentation(message: Image) -> np.ndarray:
+    """A ``mono16`` Image to (H, W) uint16 labels.
+
+    Raises:
+        MessageError: another encoding, or sizes that disagree.
+    """
+    if message.encoding != "mono16":
+        raise MessageError(f"segmentation encoding '{message.encoding}' is not mono16")
+    return _image_to_array(message, np.dtype("<u2"), 1)
+
+
+def _array_to_image(pixels: np.ndarray, encoding: str, stamp: int, frame: str) -> Image:
+    image = Image(header=make_header(stamp, frame), height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
+    image.step = pixels.strides[0] if pixels.flags.c_contiguous else pixels[0].nbytes
+    image.data = _bytes_of(pixels)
+    return image
+
+
+def _bytes_of(values: np.ndarray) -> array.array:
+    """The array's bytes in the one container that a message's setter takes without looking at every byte."""
+    data = array.array("B")
+    if values.size:
+        data.frombytes(memoryview(np.ascontiguousarray(values)).cast("B"))
+    return data
+
+
+def _image_to_array(message: Image, dtype: np.dtype, channels: int) -> np.ndarray:
+    height, width, step = message.height, message.width, message.step
+    row_bytes = width * channels * dtype.itemsize
+    if height == 0 or width == 0:
+        raise MessageError(f"image is empty ({width}x{height})")
+    if message.is_bigendian and dtype.itemsize > 1:
+        raise MessageError("big-endian images are not supported")
+    if step < row_bytes or len(message.data) != step * height:
+        raise MessageError(
+            f"{message.encoding} image of {width}x{height} has step {step} and {len(message.data)} bytes of data"
+        )
+    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, :row_bytes]
+    pixels = np.ascontiguousarray(rows).view(dtype)
+    return pixels.reshape(height, width, channels) if channels > 1 else pixels.reshape(height, width)
+
+
+# Cameras
+
+
+def camera_to_info(camera: PinholeCamera, stamp: int, frame: str) -> CameraInfo:
+    """Intrinsics of a rectified camera to a CameraInfo."""
+    info = CameraInfo(header=make_header(stamp, frame), height=camera.height, width=camera.width)
+    info.distortion_model = "plumb_bob"
+    info.d = [0.0] * 5
+    info.k = camera.matrix.ravel()
+    info.r = np.eye(3).ravel()
+    info.p = np.hstack([camera.matrix, np.zeros((3, 1))]).ravel()
+    return info
+
+
+def info_to_camera(message: CameraInfo) -> PinholeCamera:
+    """A CameraInfo of a rectified camera to intrinsics.
+
+    Raises:
+        MessageError: the image is not rectified, or the numbers make no camera.
+    """
+    if np.any(message.d):
+        raise MessageError("camera_info has distortion; publish rectified images (image_proc) with d = 0")
+    k = np.asarray(message.k, float).reshape(3, 3)
+    try:
+        return PinholeCamera(int(message.width), int(message.height), *map(float, (k[0, 0], k[1, 1], k[0, 2], k[1, 2])))
+    except ValueError as error:
+        raise MessageError(f"camera_info: {error}") from error
+
+
+# Tables
+
+
+def hypotheses_to_cloud(hypotheses: Hypotheses, stamp: int, frame: str) -> PointCloud2:
+    """Hypotheses (without their segmentation) to a table with the columns of ``HYPOTHESIS_COLUMNS``."""
+    table = np.zeros(len(hypotheses), _layout(HYPOTHESIS_COLUMNS))
+    _fill_poses(table, hypotheses.T_camera_object)
+    _fill_box(table, hypotheses.box)
+    for column in ("score", "depth", "label"):
+        table[column] = getattr(hypotheses, column)
+    return _table_to_cloud(table, stamp, frame)
+
+
+def hypotheses_from_cloud(message: PointCloud2, segmentation: np.ndarray, frame: str) -> Hypotheses:
+    """A table of hypotheses and the (H, W) label image of the same view to Hypotheses.
+
+    Raises:
+        MessageError: another frame, a missing column, a bad number, or a label that is 0.
+    """
+    table = _cloud_to_table(message, HYPOTHESIS_COLUMNS, frame)
+    if (table["label"] == 0).any():
+        raise MessageError("hypotheses: label 0 means background")
+    return Hypotheses(
+        _read_poses(table), _read(table, "score"), _read_box(table), _read(table, "depth"), table["label"], segmentation
+    )
+
+
+def objects_to_cloud(objects: SceneObjects, stamp: int, frame: str) -> PointCloud2:
+    """Accumulated objects to a table with the columns of ``OBJECT_COLUMNS``."""
+    table = np.zeros(len(objects), _layout(OBJECT_COLUMNS))
+    _fill_poses(table, objects.T_world_object)
+    _fill_box(table, objects.box)
+    for column in ("verification", "score", "depth", "support", "spread"):
+        table[column] = getattr(objects, column)
+    return _table_to_cloud(table, stamp, frame)
+
+
+def objects_from_cloud(message: PointCloud2, frame: str) -> SceneObjects:
+    """A table of accumulated objects to SceneObjects.
+
+    Raises:
+        MessageError: another frame, a missing column or a bad number.
+    """
+    table = _cloud_to_table(message, OBJECT_COLUMNS, frame)
+    return SceneObjects(
+        T_world_object=_read_poses(table),
+        box=_read_box(table),
+        support=table["support"].astype(int),
+        **{column: _read(table, column) for column in ("verification", "score", "depth", "spread")},
+    )
+
+
+def attention_to_cloud(
+    positions: np.ndarray, weight: np.ndarray, attended: int | None, stamp: int, frame: str
+) -> PointCloud2:
+    """Object positions (n, 3), attention weights (n,) and the attended index to a table of ``ATTENTION_COLUMNS``."""
+    table = np.zeros(len(weight), _layout(ATTENTION_COLUMNS))
+    for axis, column in enumerate("xyz"):
+        table[column] = positions[:, axis]
+    table["weight"] = weight
+    if attended is not None:
+        table["attended"][attended] = 1
+    return _table_to_cloud(table, stamp, frame)
+
+
+def attention_from_cloud(message: PointCloud2, frame: str) -> tuple[np.ndarray, int | None]:
+    """A table of attention to its weights (n,) and the attended index, None without one.
+
+    Raises:
+        MessageError: another frame, a missing column or a bad number.
+    """
+    table = _cloud_to_table(message, ATTENTION_COLUMNS, frame)
+    marked = np.flatnonzero(table["attended"])
+    return _read(table, "weight"), int(marked[0]) if len(marked) else None
+
+
+def _layout(columns: dict[str, str]) -> np.dtype:
+    return np.dtype(list(columns.items()), align=True)
+
+
+def _table_to_cloud(table: np.ndarray, stamp: int, frame: str) -> PointCloud2:
+    fields = [
+        PointField(name=name, offset=table.dtype.fields[name][1], datatype=_DATATYPES[table.dtype[name].str], count=1)
+        for name in table.dtype.names
+    ]
+    cloud = PointCloud2(header=make_header(stamp, frame), height=1, width=len(table), fields=fields)
+    cloud.point_step = table.dtype.itemsize
+    cloud.row_step = table.nbytes
+    cloud.is_dense = True
+    cloud.data = _bytes_of(table.view(np.uint8) if len(table) else table)
+    return cloud
+
+
+def _cloud_to_table(message: PointCloud2, columns: dict[str, str], frame: str) -> np.ndarray:
+    """A cloud's named columns as a structured array; other columns and any padding are ignored."""
+    require_frame(message.header, frame)
+    if message.is_bigendian:
+        raise MessageError("big-endian tables are not supported")
+    rows = message.width * message.height
+    if message.row_step != message.point_step * message.width or len(message.data) != message.row_step * message.height:
+        raise MessageError(
+            f"table of {rows} rows has steps {message.point_step}, {message.row_step} and {len(message.data)} bytes"
+        )
+    offsets = {field.name: (field.offset, field.datatype, field.count) for field in message.fields}
+    for name, dtype in columns.items():
+        offset, datatype, count = offsets.get(name, (0, None, 0))
+        if datatype != _DATATYPES[dtype] or count != 1 or offset + np.dtype(dtype).itemsize > message.point_step:
+            raise MessageError(f"table has no usable column '{name}' of type {dtype}")
+    layout = {
+        "names": list(columns),
+        "formats": list(columns.values()),
+        "offsets": [offsets[name][0] for name in columns],
+    }
+    if rows == 0:
+        return np.zeros(0, _layout(columns))
+    return np.frombuffer(message.data, np.dtype({**layout, "itemsize": message.point_step}))
+
+
+def _fill_poses(table: np.ndarray, T: np.ndarray) -> None:
+    quaternions = quaternion_from_transform(T) if len(T) else np.zeros((0, 4))
+    for column, values in zip(_POSE_COLUMNS, [*T[:, :3, 3].T, *quaternions.T], strict=True):
+        table[column] = values
+
+
+def _fill_box(table: np.ndarray, box: np.ndarray) -> None:
+    for column, values in zip(_BOX_COLUMNS, box.T, strict=True):
+        table[column] = values
+
+
+def _read(table: np.ndarray, column: str) -> np.ndarray:
+    values = table[column].astype(float)
+    if not np.isfinite(values).all():
+        raise MessageError(f"column '{column}' holds a number that is not finite")
+    return values
+
+
+def _read_poses(table: np.ndarray) -> np.ndarray:
+    rows = np.stack([table[column].astype(float) for column in _POSE_COLUMNS], axis=1)
+    return _rows_to_transforms(rows) if len(rows) else np.zeros((0, 4, 4))
+
+
+def _read_box(table: np.ndarray) -> np.ndarray:
+    return np.stack([_read(table, column) for column in _BOX_COLUMNS], axis=1)
+
+
+# Markers
+
+
+def objects_to_markers(objects: SceneObjects, mesh_uri: str, stamp: int, frame: str) -> MarkerArray:
+    """One mesh per object, from red (verification score 0) to green (1), after one marker that clears the last ones."""
+    markers = [Marker(header=make_header(stamp, frame), action=Marker.DELETEALL)]
+    for index, (T, verification) in enumerate(zip(objects.T_world_object, objects.verification, strict=True)):
+        marker = Marker(header=make_header(stamp, frame), ns="objects", id=index, type=Marker.MESH_RESOURCE)
+        marker.mesh_resource = mesh_uri
+        marker.pose = transform_to_pose(T)
+        marker.scale.x = marker.scale.y = marker.scale.z = 1.0
+        certainty = float(np.clip(verification, 0.0, 1.0))
+        marker.color = ColorRGBA(r=1.0 - certainty, g=certainty, b=0.1, a=0.8)
+        markers.append(marker)
+    return MarkerArray(markers=markers)

@@ -1,0 +1,272 @@
+"""What every node of the graph shares: lifecycle, checked parameters, guarded inputs, diagnostics, matching of stamps."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.context import Context
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from active6d_core.conversions import MessageError, ns_to_stamp
+
+_QUEUE_DEPTH = 10
+_LOG_PERIOD_SECONDS = 5.0
+
+
+class GraphNode(LifecycleNode):
+    """A lifecycle node that survives bad input and says how it is doing.
+
+    Subclasses declare parameters and create inputs and outputs in ``__init__``, do what is heavy in :meth:`setup`, and
+    start their work in :meth:`begin`. Inputs are ignored until the node is active.
+
+    Raises:
+        ValueError: a parameter is out of its range or of another type; the message names it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        context: Context | None = None,
+        namespace: str = "",
+        overrides: dict[str, Any] | None = None,
+    ) -> None:
+        parameters = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
+        super().__init__(name, context=context, namespace=namespace, parameter_overrides=parameters)
+        self._active = False
+        self._failure: Exception | None = None
+        self._views = 0
+        self._rejected = 0
+        self._last_view_at: float | None = None
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 100)
+        self.autostart = self.declare("autostart", True, "configure and activate the node by itself when it starts")
+        self.world_frame = self.declare("world_frame", "world", "frame of the bin: origin at its centre, z up")
+        self.camera_frame = self.declare(
+            "camera_frame", "camera_optical_frame", "optical frame of the camera (REP-103)"
+        )
+
+    # What a subclass overrides
+
+    def setup(self) -> None:
+        """Heavy start-up: load models, drop scenes. Runs on configure."""
+
+    def begin(self) -> None:
+        """First work of an active node. Runs on activate."""
+
+    def teardown(self) -> None:
+        """Release what :meth:`setup` made. Runs on cleanup and shutdown."""
+
+    # Parameters, inputs and outputs
+
+    def declare(
+        self,
+        name: str,
+        default: Any,
+        description: str,
+        *,
+        minimum: float | None = None,
+        maximum: float | None = None,
+        choices: Sequence[str] | None = None,
+    ) -> Any:
+        """Declare a read-only parameter and return its checked value."""
+        limits = [f">= {minimum}"] * (minimum is not None) + [f"<= {maximum}"] * (maximum is not None)
+        if choices is not None:
+            limits.append("one of " + ", ".join(choices))
+        descriptor = ParameterDescriptor(
+            description=description, additional_constraints="; ".join(limits), read_only=True
+        )
+        try:
+            value = self.declare_parameter(name, default, descriptor).value
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            expected = f"a {type(default).__name__} such as {default!r}"
+            raise ValueError(f"{self.get_name()}: parameter '{name}' must be {expected} ({error})") from error
+        low = minimum is not None and not value >= minimum
+        high = maximum is not None and not value <= maximum
+        if low or high or (choices is not None and value not in choices):
+            raise ValueError(f"{self.get_name()}: parameter '{name}' is {value!r}, must be {' and '.join(limits)}")
+        return value
+
+    def output(self, message_type: type, topic: str, latched: bool = False) -> Publisher:
+        """A reliable publisher; ``latched`` keeps its last message for those who come later (transient-local)."""
+        return self.create_lifecycle_publisher(
+            message_type, topic, _qos(latched, depth=1), qos_overriding_options=_overridable()
+        )
+
+    def input(
+        self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool = False
+    ) -> Subscription:
+        """A reliable subscription whose callback may raise :class:`MessageError`: the message is refused, the node lives."""
+
+        def guarded(message: Any) -> None:
+            if not self._active:
+                return
+            try:
+                callback(message)
+            except MessageError as error:
+                self.reject(f"{topic}: {error}")
+
+        return self.create_subscription(
+            message_type, topic, guarded, _qos(latched, depth=_QUEUE_DEPTH), qos_overriding_options=_overridable()
+        )
+
+    # Diagnostics
+
+    def reject(self, reason: str) -> None:
+        """Log a refused message (throttled) and tell /diagnostics."""
+        self._rejected += 1
+        self.get_logger().error(reason, throttle_duration_sec=_LOG_PERIOD_SECONDS)
+        self._diagnose(DiagnosticStatus.ERROR, reason, 0, {})
+
+    @contextmanager
+    def measure(self, stamp: int) -> Iterator[None]:
+        """Time the work on the view with this stamp and publish latency and rate on /diagnostics."""
+        started = time.perf_counter()
+        yield
+        finished = time.perf_counter()
+        self._views += 1
+        values = {"latency_ms": f"{(finished - started) * 1e3:.3f}"}
+        if self._last_view_at is not None:
+            values["rate_hz"] = f"{1.0 / max(finished - self._last_view_at, 1e-9):.3f}"
+        self._last_view_at = finished
+        self._diagnose(DiagnosticStatus.OK, "view processed", stamp, values)
+
+    def _diagnose(self, level: bytes, message: str, stamp: int, values: dict[str, str]) -> None:
+        values = {**values, "views": str(self._views), "rejected": str(self._rejected)}
+        status = DiagnosticStatus(
+            level=level, name=self.get_fully_qualified_name(), message=message, hardware_id="active6d"
+        )
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        report = DiagnosticArray(status=[status])
+        report.header.stamp = ns_to_stamp(stamp)
+        self._diagnostics.publish(report)
+
+    # Lifecycle
+
+    def start(self) -> None:
+        """Configure and activate.
+
+        Raises:
+            Exception: what :meth:`setup` or :meth:`begin` raised.
+        """
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                raise self._failure or RuntimeError(f"{self.get_name()}: could not start")
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run :meth:`setup`."""
+        return self._attempt(self.setup)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the outputs, then run :meth:`begin`."""
+        super().on_activate(state)
+        self._active = True
+        return self._attempt(self.begin)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close inputs and outputs."""
+        self._active = False
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run :meth:`teardown`."""
+        return self._attempt(self.teardown)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run :meth:`teardown`."""
+        self._active = False
+        return self._attempt(self.teardown)
+
+    def _attempt(self, step: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            step()
+        # Any failure must become a refused transition: rclpy would swallow the exception and lose its text.
+        except Exception as error:
+            self._failure = error
+            self.get_logger().error(f"{step.__name__} failed: {error}")
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+
+class StampSynchronizer:
+    """Collects one value per name for each stamp and hands complete sets on, in order of their stamps.
+
+    Args:
+        names: what makes a set complete.
+        callback: called with the stamp (ns) and {name: value}.
+        depth: incomplete stamps kept; the oldest is dropped first.
+    """
+
+    def __init__(self, names: Sequence[str], callback: Callable[[int, dict[str, Any]], None], depth: int = 8) -> None:
+        self._names = frozenset(names)
+        self._callback = callback
+        self._depth = depth
+        self._pending: dict[int, dict[str, Any]] = {}
+        self._last_complete = -1
+
+    def add(self, name: str, stamp: int, value: Any) -> None:
+        """Take a value; a second one for an incomplete stamp replaces the first (its sender was restarted).
+
+        Raises:
+            MessageError: the stamp was completed already, or is older than the last complete one.
+        """
+        if stamp <= self._last_complete:
+            kind = "duplicate" if stamp == self._last_complete else "stale"
+            raise MessageError(
+                f"{kind} stamp {stamp * 1e-9:.3f} s of {name}, already at {self._last_complete * 1e-9:.3f} s"
+            )
+        self._pending.setdefault(stamp, {})[name] = value
+        if self._pending[stamp].keys() == self._names:
+            values = self._pending[stamp]
+            self._last_complete = stamp
+            self._pending = {later: kept for later, kept in self._pending.items() if later > stamp}
+            self._callback(stamp, values)
+        elif len(self._pending) > self._depth:
+            del self._pending[min(self._pending)]
+
+    def missing(self) -> dict[int, set[str]]:
+        """Names still awaited, per incomplete stamp."""
+        return {stamp: set(self._names - values.keys()) for stamp, values in self._pending.items()}
+
+
+def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> None:
+    """The main function of every executable: spin one node until interrupted. Exit code 2 on a bad parameter."""
+    rclpy.init(args=args)
+    node = None
+    try:
+        node = node_type()
+        if node.autostart:
+            node.start()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _qos(latched: bool, depth: int) -> QoSProfile:
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+
+def _overridable() -> QoSOverridingOptions:
+    kinds = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+    return QoSOverridingOptions(kinds)
