@@ -1,0 +1,26 @@
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint clean
+
+BIN := .venv/bin
+DEMO := bags/demo
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup:  ## make .venv ready (done by the others, too)
+	@scripts/setup.sh
+
+demo: setup  ## one episode on a heap of mugs: a bag and a report in bags/demo
+	rm -rf $(DEMO)
+	$(BIN)/active6d episode --object mug --seed 7 --policy lowest-score --steps 5 --bag $(DEMO)
+	$(BIN)/active6d report $(DEMO)
+
+test: setup  ## all tests
+	$(BIN)/python -m pytest tests
+
+lint: setup  ## ruff on all Python files
+	$(BIN)/ruff check src tests
+
+clean:  ## remove .venv, builds and recorded bags
+	rm -rf .venv ros2_ws/{build,install,log} bags/* src/*/*.egg-info src/*/build .pytest_cache .ruff_cache .hypothesis
