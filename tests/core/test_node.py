@@ -1,0 +1,139 @@
+"""The base of every node: parameters, guarded inputs, diagnostics, lifecycle and the matching of stamps."""
+
+import numpy as np
+import pytest
+from active6d_core.conversions import MessageError, depth_to_image, image_to_depth, stamp_to_ns
+from active6d_core.node import GraphNode, StampSynchronizer
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from hypothesis import given
+from hypothesis import strategies as st
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+
+
+class DepthNode(GraphNode):
+    """Takes depth images, publishes their mean."""
+
+    def __init__(self, **kwargs):
+        super().__init__("depth_node", **kwargs)
+        self.gain = self.declare("gain", 1.0, "factor", minimum=0.0, maximum=10.0)
+        self.mode = self.declare("mode", "mean", "what to publish", choices=("mean", "max"))
+        self.result = self.output(String, "result", latched=True)
+        self.input(Image, "depth", self.on_depth, latched=True)
+        self.fail_at_setup = False
+
+    def setup(self):
+        if self.fail_at_setup:
+            raise ValueError("mesh missing.ply does not exist")
+
+    def on_depth(self, message):
+        depth = image_to_depth(message)
+        if depth.shape == (1, 1):
+            raise ZeroDivisionError("a defect in the node")
+        with self.measure(stamp_to_ns(message.header.stamp)):
+            self.result.publish(String(data=f"{depth.mean():.1f}"))
+
+
+@pytest.mark.parametrize(
+    "overrides, text",
+    [
+        ({"gain": -1.0}, "parameter 'gain' is -1.0, must be >= 0.0 and <= 10.0"),
+        ({"gain": float("nan")}, "parameter 'gain' is nan"),
+        ({"gain": "much"}, "parameter 'gain' must be a float such as 1.0"),
+        ({"mode": "median"}, "must be one of mean, max"),
+    ],
+)
+def test_bad_parameters_are_named(graph, overrides, text):
+    with pytest.raises(ValueError, match=text):
+        DepthNode(context=graph.context, overrides=overrides)
+
+
+def test_bad_input_is_refused_and_the_node_lives(graph):
+    graph.add(DepthNode(context=graph.context))
+    results, diagnostics = graph.mailbox(String, "result"), graph.mailbox(DiagnosticArray, "/diagnostics")
+    bad = depth_to_image(np.ones((2, 2), np.float32), 1, "c")
+    bad.encoding = "rgb8"
+    graph.publish("depth", bad, latched=True)
+    graph.spin_until_filled([diagnostics])
+    status = diagnostics[0].status[0]
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.name == "/depth_node"
+    assert "'rgb8' is not 32FC1" in status.message
+    graph.publish("depth", depth_to_image(np.full((2, 2), 3, np.float32), 7_000_000_005, "c"), latched=True)
+    graph.spin_until_filled([results])
+    assert results[0].data == "3.0"
+    graph.spin_until(lambda: len(diagnostics) == 2)
+    values = {item.key: item.value for item in diagnostics[1].status[0].values}
+    assert stamp_to_ns(diagnostics[1].header.stamp) == 7_000_000_005
+    assert (values["views"], values["rejected"]) == ("1", "1")
+    assert float(values["latency_ms"]) > 0
+
+
+def test_a_defect_in_a_callback_is_not_hidden(graph):
+    graph.add(DepthNode(context=graph.context))
+    graph.publish("depth", depth_to_image(np.ones((1, 1), np.float32), 1, "c"), latched=True)
+    with pytest.raises(ZeroDivisionError):
+        graph.spin_for(5.0)
+
+
+def test_inputs_are_ignored_until_the_node_is_active(graph):
+    node = graph.add(DepthNode(context=graph.context), start=False)
+    results = graph.mailbox(String, "result")
+    graph.publish("depth", depth_to_image(np.ones((2, 2), np.float32), 1, "c"), latched=True)
+    graph.spin_for(0.3)
+    assert results == []
+    node.start()
+    graph.publish("depth", depth_to_image(np.ones((2, 2), np.float32), 2, "c"), latched=True)
+    graph.spin_until_filled([results])
+
+
+def test_a_failing_setup_is_reported_with_its_reason(graph):
+    node = graph.add(DepthNode(context=graph.context), start=False)
+    node.fail_at_setup = True
+    with pytest.raises(ValueError, match="missing.ply"):
+        node.start()
+
+
+def test_latched_inputs_reach_a_node_that_comes_late(graph):
+    results = graph.mailbox(String, "result")
+    graph.publish("depth", depth_to_image(np.full((2, 2), 5, np.float32), 1, "c"), latched=True, subscribers=0)
+    graph.add(DepthNode(context=graph.context))
+    graph.spin_until_filled([results])
+    assert results[0].data == "5.0"
+
+
+@given(st.permutations([(stamp, name) for stamp in (1, 2, 3) for name in "abc"]))
+def test_complete_sets_come_in_order_whatever_the_arrival(arrivals):
+    complete = []
+    synchronizer = StampSynchronizer("abc", lambda stamp, values: complete.append((stamp, values)))
+    for stamp, name in arrivals:
+        try:
+            synchronizer.add(name, stamp, f"{name}{stamp}")
+        except MessageError:
+            assert complete[-1][0] >= stamp
+    stamps = [stamp for stamp, _ in complete]
+    assert stamps == sorted(set(stamps))
+    # The newest stamp always completes: nothing newer can make it stale.
+    assert stamps[-1] == 3
+    assert all(values == {name: f"{name}{stamp}" for name in "abc"} for stamp, values in complete)
+
+
+def test_a_replacement_is_taken_until_the_set_is_complete():
+    complete = []
+    synchronizer = StampSynchronizer("ab", lambda stamp, values: complete.append(values))
+    synchronizer.add("a", 1, "first")
+    synchronizer.add("a", 1, "again")
+    assert synchronizer.missing() == {1: {"b"}}
+    synchronizer.add("b", 1, "b")
+    assert complete == [{"a": "again", "b": "b"}]
+    with pytest.raises(MessageError, match="duplicate"):
+        synchronizer.add("b", 1, "b")
+    with pytest.raises(MessageError, match="stale"):
+        synchronizer.add("b", 0, "b")
+
+
+def test_incomplete_sets_do_not_pile_up():
+    synchronizer = StampSynchronizer("ab", lambda stamp, values: None, depth=4)
+    for stamp in range(100):
+        synchronizer.add("a", stamp, None)
+    assert sorted(synchronizer.missing()) == [96, 97, 98, 99]
