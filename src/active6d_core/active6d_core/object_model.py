@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 SHIPPED_OBJECTS = Path(__file__).parent / "objects"
 _REQUIRED = {"name", "instances", "color"}
 _OPTIONAL = {"mesh", "profile", "scale", "symmetry", "features", "source"}
+_LARGEST_GROUP = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +173,21 @@ def _read_symmetry(description: dict) -> Symmetry:
             raise ValueError("symmetry.axis needs three numbers, not all zero")
         axis = axis / np.linalg.norm(axis)
     rotation_vectors = np.array(description.get("discrete_rotvec_degrees") or np.zeros((0, 3)), float).reshape(-1, 3)
-    generated = (
-        Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix() if len(rotation_vectors) else np.zeros((0, 3, 3))
-    )
-    return Symmetry(axis, np.concatenate([np.eye(3)[None], generated]))
+    return Symmetry(axis, _generate_group(Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix()))
+
+
+def _generate_group(generators: np.ndarray) -> np.ndarray:
+    """(s, 3, 3) every product of (g, 3, 3) generators, the identity first.
+
+    An error that is the least over half a group would depend on which of two equal poses is called the truth.
+    """
+    group = np.eye(3)[None]
+    while True:
+        products = np.concatenate([group, (generators[:, None] @ group).reshape(-1, 3, 3)])
+        distance = np.abs(products[:, None] - products).max(axis=(2, 3))
+        is_new = ~(np.tril(distance < 1e-6, k=-1)).any(axis=1)
+        if is_new.sum() == len(group):
+            return group
+        group = products[is_new]
+        if len(group) > _LARGEST_GROUP:
+            raise ValueError("symmetry.discrete_rotvec_degrees does not generate a finite group; check the angles")
