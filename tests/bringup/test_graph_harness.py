@@ -33,8 +33,8 @@ def test_callback_exception_fails_the_test(graph):
 
     broken.create_subscription(String, "in", fail, 10)
     graph.add(broken)
+    graph.publish("in", String(data="now"))
     with pytest.raises(ZeroDivisionError, match="now"):
-        graph.publish("in", String(data="now"))
         graph.spin_for(5.0)
 
 

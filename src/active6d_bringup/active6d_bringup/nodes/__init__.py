@@ -1,0 +1,1 @@
+"""Nodes that record and replay episodes."""

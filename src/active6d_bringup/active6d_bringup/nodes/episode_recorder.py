@@ -1,0 +1,101 @@
+"""Records every topic of the graph into a rosbag2 folder, as the serialized messages that went over the wire."""
+
+import signal
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
+
+from active6d_bringup.recording import CONTRACT, EpisodeWriter, RecordedTopic, describe_missing
+from active6d_core.node import GraphNode, run_node
+
+
+class EpisodeRecorderNode(GraphNode):
+    """Writes a bag; the folder appears on configure, its metadata when the node ends.
+
+    Queues keep everything, so nothing is lost however slow the disk; what is still queued when the node is destroyed is
+    written before the bag is closed.
+    """
+
+    def __init__(self, **arguments) -> None:
+        super().__init__("episode_recorder", **arguments)
+        self._folder = self.declare("bag", "", "folder to create for the bag")
+        self._latched_camera = self.declare(
+            "latched_camera", True, "the camera keeps its last view (transient-local); false for drivers that do not"
+        )
+        self._writer: EpisodeWriter | None = None
+        self._subscriptions_by_topic = {topic.name: self._subscribe(topic) for topic in CONTRACT}
+        self.create_service(Trigger, "~/complete", self._answer_complete)
+
+    def setup(self) -> None:
+        """Create the bag.
+
+        Raises:
+            ValueError: no folder is named.
+            RecordingError: the folder exists, or cannot be made.
+        """
+        if not self._folder:
+            raise ValueError("episode_recorder: parameter 'bag' must name a folder to create")
+        names = {topic: subscription.topic_name for topic, subscription in self._subscriptions_by_topic.items()}
+        self._writer = EpisodeWriter(Path(self._folder).expanduser(), names)
+        self.get_logger().info(f"recording into {self._folder}")
+
+    def teardown(self) -> None:
+        """Write what is still queued and close the bag."""
+        if self._writer is not None:
+            self.drain()
+            self._writer.close()
+            self.get_logger().info(f"{self._writer.message_count} messages in {self._folder}")
+            self._writer = None
+
+    def destroy_node(self) -> None:
+        """Close the bag, then destroy the node."""
+        self.teardown()
+        super().destroy_node()
+
+    def drain(self) -> None:
+        """Write everything that has arrived but waits for its callback."""
+        for topic, subscription in self._subscriptions_by_topic.items():
+            while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                self._write(topic, taken[0])
+
+    def missing(self, stamp: int) -> list[str]:
+        """Topics that the recording of an episode ending at the view with this stamp (ns) still waits for."""
+        return self._writer.missing(stamp)
+
+    def _subscribe(self, topic: RecordedTopic) -> Subscription:
+        latched = topic.latched and (self._latched_camera or not topic.name.startswith("camera/"))
+        qos = QoSProfile(
+            history=HistoryPolicy.KEEP_ALL,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        package, _, name = topic.type.split("/")
+        message_type = getattr(import_module(f"{package}.msg"), name)
+        return self.create_subscription(message_type, topic.name, partial(self._write, topic.name), qos, raw=True)
+
+    def _write(self, topic: str, payload: bytes) -> None:
+        if self._writer is not None:
+            self._writer.write(topic, payload, self.get_clock().now().nanoseconds)
+
+    def _answer_complete(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Whether the last episode that has ended is on record in full."""
+        end = self._writer.last_end if self._writer else None
+        missing = ["episode/end"] if end is None else self._writer.missing(end)
+        response.success = not missing
+        response.message = describe_missing(missing) if missing else "complete"
+        return response
+
+
+def main() -> None:
+    """Entry point."""
+    # An interrupt must end the spinning, not whatever is being written; rclpy's own handler does just that.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    run_node(EpisodeRecorderNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""The recorder's bag holds what was sent, byte by byte, and two other libraries read it."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+from collections import defaultdict
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rclpy.serialization import serialize_message
+from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.rosbag2 import Reader
+from std_srvs.srv import Trigger
+from stub_episode import StubEpisode, is_latched
+
+from active6d_bringup.nodes.episode_recorder import EpisodeRecorderNode
+from active6d_bringup.recording import CONTRACT, TYPESTORE, RecordingError, stamp_of
+from active6d_core.node import GraphNode
+
+TYPES = {topic.name: topic.type for topic in CONTRACT}
+
+
+def record(graph, folder, episode, late=False):
+    """Send the stub episode past a recorder, which starts after the first latched messages if ``late``."""
+    sent = episode.messages()
+    early = [item for item in sent if late and is_latched(item[0]) and item[1].header.stamp.sec == 1][:6]
+    early = [item for item in early if item[1].header.stamp.nanosec == 0]
+    for topic, message in early:
+        graph.publish(topic, message, latched=True, subscribers=0)
+    recorder = graph.add(EpisodeRecorderNode(context=graph.context, overrides={"bag": str(folder)}))
+    for topic, message in sent:
+        if not any(message is other for _, other in early):
+            graph.publish(topic, message, latched=is_latched(topic))
+    return recorder, sent
+
+
+def assert_holds(folder, sent):
+    expected = defaultdict(list)
+    for topic, message in sent:
+        name = topic if topic.startswith("/") else f"/{topic}"
+        expected[name].append(canonical(serialize_message(message), TYPES[topic]))
+    found = defaultdict(list)
+    with Reader(folder) as reader:
+        for connection, _, payload in reader.messages():
+            found[connection.topic].append(canonical(payload, connection.msgtype))
+    assert found == expected
+
+
+def canonical(payload, message_type):
+    """The payload with zeros in CDR's padding, which the middleware leaves undefined."""
+    return bytes(TYPESTORE.serialize_cdr(TYPESTORE.deserialize_cdr(payload, message_type), message_type))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_every_message_is_recorded_unchanged(graph, tmp_path, late):
+    recorder, sent = record(graph, tmp_path / "bag", StubEpisode(), late)
+    graph.remove(recorder)  # what has not been taken from the queues yet is written at the end
+    assert_holds(tmp_path / "bag", sent)
+
+
+def test_metadata_and_chunks(graph, tmp_path):
+    recorder, sent = record(graph, tmp_path / "bag", StubEpisode())
+    graph.remove(recorder)
+    metadata = yaml.safe_load((tmp_path / "bag/metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert metadata["storage_identifier"] == "mcap"
+    assert metadata["message_count"] == len(sent)
+    with Reader(tmp_path / "bag") as reader:
+        offered = {item.topic.lstrip("/"): item.ext.offered_qos_profiles[0] for item in reader.connections}
+    assert offered.keys() == {topic.name.lstrip("/") for topic in CONTRACT}
+    for topic in CONTRACT:
+        qos = offered[topic.name.lstrip("/")]
+        assert qos.reliability == QosReliability.RELIABLE
+        assert (qos.durability == QosDurability.TRANSIENT_LOCAL) == topic.latched
+    with next((tmp_path / "bag").glob("*.mcap")).open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+
+
+def test_mcap_library_decodes_by_the_schema_in_the_file(graph, tmp_path):
+    episode = StubEpisode()
+    recorder, sent = record(graph, tmp_path / "bag", episode)
+    graph.remove(recorder)
+    decoded = defaultdict(list)
+    data = io.BytesIO(next((tmp_path / "bag").glob("*.mcap")).read_bytes())
+    reader = make_reader(data, decoder_factories=[DecoderFactory()])
+    for _, channel, _, message in reader.iter_decoded_messages():
+        decoded[channel.topic].append(message)
+    assert sum(map(len, decoded.values())) == len(sent)
+    assert [m.header.stamp.nanosec for m in decoded["/camera/pose"]] == [s.view.stamp % 10**9 for s in episode.steps]
+    assert bytes(decoded["/camera/color/image_raw"][1].data) == episode.steps[1].view.color.tobytes()
+    assert decoded["/objects/markers"][0].markers[1].mesh_resource == "package://x/mug.obj"
+
+
+def test_completeness_names_the_topics_awaited(graph, tmp_path):
+    recorder = graph.add(EpisodeRecorderNode(context=graph.context, overrides={"bag": str(tmp_path / "bag")}))
+    assert "episode/end" in graph.call(Trigger, "episode_recorder/complete").message
+    sent = StubEpisode(moves=1).messages()
+    last = sent[-1][1].header.stamp.sec * 10**9 + sent[-1][1].header.stamp.nanosec
+    withheld = [("view_goal", 0), ("objects/markers", 1)]
+    seen = defaultdict(int)
+    late = []
+    for topic, message in sent:
+        if (topic, seen[topic]) in withheld:
+            late.append((topic, message))
+        else:
+            graph.publish(topic, message, latched=is_latched(topic))
+        seen[topic] += 1
+    graph.spin_until(lambda: "episode/end" not in recorder.missing(last))
+    graph.spin_until(lambda: set(recorder.missing(last)) == {"view_goal", "objects/markers"})
+    answer = graph.call(Trigger, "episode_recorder/complete")
+    assert not answer.success
+    assert "attention_policy, hypothesis_fusion" in answer.message
+    for topic, message in late:
+        graph.publish(topic, message)
+    graph.spin_until(lambda: not recorder.missing(last))
+    assert graph.call(Trigger, "episode_recorder/complete").success
+
+
+def test_existing_folder_is_refused(graph, tmp_path):
+    with pytest.raises(RecordingError, match="exists already"):
+        graph.add(EpisodeRecorderNode(context=graph.context, overrides={"bag": str(tmp_path)}))
+
+
+def test_namespace_is_kept(graph, tmp_path):
+    recorder = EpisodeRecorderNode(context=graph.context, namespace="cell", overrides={"bag": str(tmp_path / "bag")})
+    graph.add(recorder)
+    for topic, message in StubEpisode().messages():
+        graph.publish(topic if topic.startswith("/") else f"cell/{topic}", message, latched=is_latched(topic))
+    graph.remove(recorder)
+    with Reader(tmp_path / "bag") as reader:
+        assert "/cell/camera/pose" in {connection.topic for connection in reader.connections}
+        assert reader.message_count == len(StubEpisode().messages())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_recorder_closes_its_bag(graph, tmp_path, number):
+    command = [sys.executable, "-m", "active6d_bringup.nodes.episode_recorder"]
+    command += ["--ros-args", "-p", f"bag:={tmp_path / 'bag'}"]
+    process = subprocess.Popen(command, env={**os.environ, "ROS_DOMAIN_ID": str(graph.domain)})
+    try:
+        sent = StubEpisode().messages()
+        for topic, message in sent[:20]:
+            graph.publish(topic, message, latched=is_latched(topic), timeout=20)
+        answer = graph.call(Trigger, "episode_recorder/complete")
+        assert not answer.success
+        process.send_signal(number)
+        assert process.wait(10) == 0
+    finally:
+        process.kill()
+        process.wait()
+    assert_holds(tmp_path / "bag", sent[:20])
+
+
+@pytest.mark.parametrize("topic", CONTRACT, ids=lambda topic: topic.name)
+def test_stamp_is_read_from_the_serialized_message(topic):
+    for name, message in StubEpisode(first=7_123_456_789).messages():
+        if name == topic.name:
+            header = message.markers[0].header if hasattr(message, "markers") else message.header
+            expected = header.stamp.sec * 10**9 + header.stamp.nanosec
+            assert stamp_of(topic.type, serialize_message(message)) == expected
+
+
+def test_recorder_is_a_graph_node():
+    assert issubclass(EpisodeRecorderNode, GraphNode)
