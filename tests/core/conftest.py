@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+
 from active6d_core.object_model import ObjectModel, read_description
 
 DESCRIPTIONS = {

@@ -4,14 +4,15 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from active6d_core import metrics
-from active6d_core.camera import DEFAULT_CAMERA
-from active6d_core.se3 import make_transform
-from active6d_core.view_sphere import ViewSphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
+
+from active6d_core import metrics
+from active6d_core.camera import DEFAULT_CAMERA
+from active6d_core.se3 import make_transform
+from active6d_core.view_sphere import ViewSphere
 
 NAMES = ["cup", "spool", "brick", "wedge"]
 

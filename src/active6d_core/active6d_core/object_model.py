@@ -73,7 +73,7 @@ class ObjectModel:
 
     @cached_property
     def error_points(self) -> np.ndarray:
-        """(n, 3) the model points that pose errors average over: the mesh's vertices, or 2000 surface points if fewer."""
+        """(n, 3) model points that pose errors average over: the vertices, or 2000 surface points if fewer."""
         vertices = np.asarray(self.mesh.vertices)
         return vertices if len(vertices) >= 2000 else self.surface[0][:2000]
 
@@ -108,7 +108,10 @@ def read_description(path: Path) -> ObjectModel:
     Raises:
         ValueError: the description or the mesh is wrong; the message names the file and the key.
     """
-    description = yaml.safe_load(path.read_text())
+    try:
+        description = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(description, dict):
         raise ValueError(f"{path}: not a mapping of keys")
     missing, unknown = _REQUIRED - description.keys(), description.keys() - _REQUIRED - _OPTIONAL
@@ -133,7 +136,7 @@ def read_description(path: Path) -> ObjectModel:
                 key: np.array(box, float).reshape(2, 3) for key, box in (description.get("features") or {}).items()
             },
         )
-    except (TypeError, KeyError, ValueError) as error:
+    except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise ValueError(f"{path}: {error}") from error
 
 
@@ -153,7 +156,10 @@ def _load_mesh(description: dict, path: Path) -> trimesh.Trimesh:
         if not mesh_path.is_file():
             raise ValueError(f"mesh {mesh_path} does not exist")
         mesh = trimesh.load_mesh(mesh_path)
-    mesh.apply_scale(float(description.get("scale", 1.0)))
+    scale = float(description.get("scale", 1.0))
+    if not 0 < scale < np.inf:
+        raise ValueError(f"scale must be positive, got {scale}")
+    mesh.apply_scale(scale)
     if not len(mesh.faces) or mesh.volume <= 0:
         raise ValueError("mesh has no faces, or its faces point inwards (negative volume)")
     # With the origin at the mass centre, physics needs no inertial offset and rotation errors do not leak into ADD.
@@ -166,6 +172,9 @@ def _diameter(mesh: trimesh.Trimesh) -> float:
 
 
 def _read_symmetry(description: dict) -> Symmetry:
+    unknown = description.keys() - {"axis", "discrete_rotvec_degrees"}
+    if unknown:
+        raise ValueError(f"symmetry has unknown keys {sorted(unknown)}")
     axis = description.get("axis")
     if axis is not None:
         axis = np.array(axis, float)
