@@ -6,9 +6,13 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-# soname and the Debian package that holds it: what the wheels link to and do not bring along
-SYSTEM_LIBRARIES="libusb-1.0.so.0:libusb-1.0-0 libgomp.so.1:libgomp1 libGL.so.1:libgl1 libX11.so.6:libx11-6"
+# soname and the Debian package that holds it: what Open3D's wheel links to and does not bring along
+SYSTEM_LIBRARIES="libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libEGL.so.1:libegl1 libX11.so.6:libx11-6
+    libidn2.so.0:libidn2-0 libudev.so.1:libudev1"
 TORCH_INDEX=${TORCH_INDEX:-https://download.pytorch.org/whl/cpu}
+
+quiet=()
+[ -t 1 ] || quiet=(-qq)
 
 say() { printf 'setup: %s\n' "$*"; }
 fail() { printf 'setup: %s\n' "$*" >&2; exit 1; }
@@ -64,17 +68,17 @@ ensure_requirements() {
     ensure_system_libraries
     say "making .venv with $("$python" -V) and installing requirements.txt and requirements-dev.txt (some minutes)"
     "$python" -m venv --clear .venv
-    .venv/bin/pip install -q --no-deps --retries 0 --timeout 5 --index-url "$TORCH_INDEX" "$(grep '^torch==' requirements.txt)" 2>/dev/null ||
+    .venv/bin/pip install -qq --no-deps --retries 0 --timeout 5 --index-url "$TORCH_INDEX" "$(grep '^torch==' requirements.txt)" 2>/dev/null ||
         say "no torch at $TORCH_INDEX; taking the default index's (with CUDA, much larger)"
-    .venv/bin/pip install -q -r requirements.txt -r requirements-dev.txt
+    .venv/bin/pip install "${quiet[@]}" --use-pep517 -r requirements.txt -r requirements-dev.txt
     echo "$wanted" >.venv/requirements.sha256
 }
 
 ensure_packages() {
     local wanted
-    wanted=$(cat .venv/requirements.sha256 src/*/{setup.py,setup.cfg,package.xml} src/active6d_bringup/{launch,config,rviz,foxglove}/* | sha256sum)
+    wanted=$(cat .venv/requirements.sha256 src/*/setup.py | sha256sum)
     [ "$wanted" = "$(cat .venv/packages.sha256 2>/dev/null)" ] && return
-    .venv/bin/pip install -q --no-deps --no-build-isolation $(printf -- '-e %s ' src/active6d_*)
+    .venv/bin/pip install -qq --no-deps --no-build-isolation --use-pep517 $(printf -- '-e %s ' src/active6d_*)
     echo "$wanted" >.venv/packages.sha256
 }
 
