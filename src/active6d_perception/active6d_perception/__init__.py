@@ -1,0 +1,1 @@
+"""Pose estimation, verification and fusion of hypotheses."""

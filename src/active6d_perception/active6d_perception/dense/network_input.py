@@ -1,0 +1,132 @@
+"""From an RGB-D view to what the network sees.
+
+Distances come in diameters of the object and directions in the frame of the pixel's own ray, so that an object looks
+the same to the network wherever it is in the picture; only its apparent size tells how far away it is.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from active6d_core.camera import PinholeCamera, View, backproject, normals_from_points, pixel_rays
+
+#: Width that a view is reduced to, by a whole factor.
+INPUT_WIDTH = 320
+#: Sides of the input are padded to multiples of this.
+MULTIPLE = 16
+#: Colour (3), normal (3), depth against its surroundings, near and far (2), validity, apparent size.
+CHANNELS = 10
+#: The network answers at the input's resolution divided by this.
+OUTPUT_STRIDE = 2
+
+_WINDOWS = (13, 61)  # pixels: a detail of an object, and more than an object
+_SAME_SURFACE = 0.02  # relative difference of depth
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedView:
+    """A view at the network's resolution.
+
+    Attributes:
+        color: (h, w, 3) uint8.
+        depth: (h, w) float32 metres, NaN where invalid.
+        camera: intrinsics of both.
+    """
+
+    color: np.ndarray
+    depth: np.ndarray
+    camera: PinholeCamera
+
+
+def reduction(camera: PinholeCamera) -> int:
+    """The whole factor that a view of ``camera`` is reduced by."""
+    return max(1, round(camera.width / INPUT_WIDTH))
+
+
+def reduce_view(view: View) -> ReducedView:
+    """Reduce a view to the network's resolution; what a whole factor does not divide is cut off at the right and bottom."""
+    factor = reduction(view.camera)
+    height, width = (size // factor for size in view.depth.shape)
+    blocks = view.color[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    color = blocks.mean(axis=(1, 3), dtype=np.float32).round().astype(np.uint8)
+    exact = view.camera.scaled(1 / factor)
+    camera = PinholeCamera(width, height, exact.fx, exact.fy, exact.cx, exact.cy)
+    return ReducedView(color, pool_depth(view.depth, factor), camera)
+
+
+def pool_depth(depth: np.ndarray, factor: int) -> np.ndarray:
+    """Reduce a depth image: in each block the mean over its nearest surface, which never lies between two surfaces.
+
+    Args:
+        depth: (H, W) metres, NaN where invalid.
+        factor: side of a block in pixels; what it does not divide is cut off at the right and bottom.
+
+    Returns:
+        (H // factor, W // factor) float32, NaN for a block without a valid pixel.
+    """
+    if factor == 1:
+        return depth.astype(np.float32)
+    height, width = (size // factor for size in depth.shape)
+    layers = [
+        depth[row : height * factor : factor, column : width * factor : factor]
+        for row in range(factor)
+        for column in range(factor)
+    ]
+    nearest = layers[0]
+    for layer in layers[1:]:
+        nearest = np.fmin(nearest, layer)
+    limit = nearest * np.float32(1 + _SAME_SURFACE)
+    total, count = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    for layer in layers:
+        near = layer <= limit
+        np.add(total, layer, out=total, where=near)
+        count += near
+    return np.divide(total, count, out=np.full((height, width), np.nan, np.float32), where=count > 0)
+
+
+def network_input(view: ReducedView, diameter: float) -> np.ndarray:
+    """The (CHANNELS, h, w) float32 tensor for one view, without padding.
+
+    Args:
+        view: at the network's resolution.
+        diameter: of the object, metres.
+    """
+    valid = np.isfinite(view.depth)
+    z = np.where(valid, view.depth, 0)
+    points = backproject(view.depth, view.camera)
+    normals = np.einsum("hwij,hwi->hwj", ray_frames(view.camera), np.nan_to_num(normals_from_points(points)))
+    channels = np.empty((CHANNELS, *z.shape), np.float32)
+    channels[:3] = np.moveaxis(view.color, -1, 0) / np.float32(255) - np.float32(0.5)
+    channels[3:6] = np.moveaxis(normals, -1, 0)
+    for channel, window in zip((6, 7), _WINDOWS, strict=True):
+        share = uniform_filter(valid.astype(np.float32), window, mode="nearest")
+        around = uniform_filter(z, window, mode="nearest") / np.maximum(share, 1e-3)
+        channels[channel] = np.where(valid, np.clip((z - around) / diameter, -1.5, 1.5), 0)
+    channels[8] = valid
+    # The last window's mean depth stands in where a pixel has none.
+    channels[9] = view.camera.fx * diameter / np.maximum(np.where(valid, z, around), 0.1) / 64
+    return channels
+
+
+def pad(tensor: np.ndarray) -> np.ndarray:
+    """Zeros at the right and bottom of (c, h, w), until both sides are multiples of :data:`MULTIPLE`."""
+    height, width = tensor.shape[1:]
+    return np.pad(tensor, ((0, 0), (0, -height % MULTIPLE), (0, -width % MULTIPLE)))
+
+
+@lru_cache(maxsize=8)
+def ray_frames(camera: PinholeCamera) -> np.ndarray:
+    """(h, w, 3, 3) ``R_camera_ray`` of every pixel: :func:`ray_rotation` of its ray. Read-only."""
+    frames = ray_rotation(pixel_rays(camera))
+    frames.flags.writeable = False
+    return frames
+
+
+def ray_rotation(direction: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) float32 rotations that turn the optical axis to (..., 3) directions the short way, about no other axis."""
+    x, y, w = np.moveaxis(direction / np.linalg.norm(direction, axis=-1, keepdims=True), -1, 0)
+    share = 1 / (1 + w)
+    rows = [[1 - x * x * share, -x * y * share, x], [-x * y * share, 1 - y * y * share, y], [-x, -y, w]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2).astype(np.float32)

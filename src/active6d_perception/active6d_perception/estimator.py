@@ -1,0 +1,69 @@
+"""What a pose estimator is, and how one is found by name. The graph knows estimators only through this module."""
+
+import inspect
+from collections.abc import Callable
+from importlib import import_module
+from typing import Protocol
+
+from active6d_core.camera import View
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.object_model import ObjectModel
+
+#: Modules that register the estimators of this package. Imported on first use, so that a depth-only estimator
+#: does not pay for the libraries of a learned one.
+_BUILT_IN = {"geometric": "active6d_perception.geometric.estimator"}
+_factories: dict[str, Callable[..., "Estimator"]] = {}
+
+
+class Estimator(Protocol):
+    """Says which instances of one object a view shows, and where."""
+
+    def estimate(self, view: View) -> Hypotheses:
+        """Pose hypotheses of ``view`` in its optical frame, with boxes and label masks (paper, "6D object pose estimation").
+
+        An estimator is deterministic: the same view gives the same hypotheses.
+        """
+        ...
+
+
+def register_estimator(name: str) -> Callable:
+    """Decorate a factory ``(model, **parameters) -> Estimator`` so that :func:`create_estimator` finds it by ``name``.
+
+    Raises:
+        ValueError: another factory has that name.
+    """
+
+    def register(factory: Callable[..., Estimator]) -> Callable[..., Estimator]:
+        if _factories.setdefault(name, factory) is not factory:
+            raise ValueError(f"an estimator named '{name}' is registered already")
+        return factory
+
+    return register
+
+
+def list_estimators() -> list[str]:
+    """Names that :func:`create_estimator` knows."""
+    return sorted(_BUILT_IN.keys() | _factories.keys())
+
+
+def create_estimator(name: str, model: ObjectModel, **parameters) -> Estimator:
+    """Make an estimator for one object.
+
+    Args:
+        name: one of :func:`list_estimators`.
+        model: the object that it looks for.
+        **parameters: keyword arguments of the estimator's factory.
+
+    Raises:
+        ValueError: unknown name, unknown parameter or bad value; the message names it and what is known.
+    """
+    if name not in _factories and name in _BUILT_IN:
+        import_module(_BUILT_IN[name])
+    if name not in _factories:
+        raise ValueError(f"unknown estimator '{name}'; known: {', '.join(list_estimators())}")
+    factory = _factories[name]
+    known = list(inspect.signature(factory).parameters)[1:]
+    unknown = sorted(parameters.keys() - set(known))
+    if unknown:
+        raise ValueError(f"estimator '{name}' has no parameter '{unknown[0]}'; known: {', '.join(known)}")
+    return factory(model, **parameters)

@@ -1,0 +1,198 @@
+"""Multi-view fusion: all hypotheses so far, clustered in the world; the best verified of each cluster is an object.
+
+The functions :func:`cluster`, :func:`select` and :func:`project_boxes` are pure and know nothing of messages or history, so a
+training environment calls the same ones on precomputed tables. :class:`SceneFusion` keeps the history for them.
+Paper, "Multi-view hypotheses fusion" and "Objects feature representation".
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import squareform
+
+from active6d_core.camera import PinholeCamera, project
+from active6d_core.hypotheses import Hypotheses, SceneObjects
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import invert
+from active6d_perception.model_views import ModelViews, model_views
+from active6d_perception.symmetric_distance import SymmetricDistance
+
+
+@dataclass(frozen=True)
+class FusionParameters:
+    """Settings of the fusion.
+
+    Attributes:
+        cut: clusters are cut where the distance between them exceeds this fraction of the diameter.
+        exclusion: of two objects whose origins are closer than this fraction of the diameter only the better verified
+            stays: solid objects cannot share their centre, but a pose that is ambiguous in some views (a mug with its
+            handle hidden) puts several clusters there. 0 keeps all.
+        min_verification: objects verified worse are not reported; the paper reports all, so -1 by default.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+
+    cut: float = 0.2
+    exclusion: float = 0.2
+    min_verification: float = -1.0
+
+    def __post_init__(self) -> None:
+        if not self.cut > 0:
+            raise ValueError(f"fusion: cut must be positive, got {self.cut}")
+        if not self.exclusion >= 0:
+            raise ValueError(f"fusion: exclusion must not be negative, got {self.exclusion}")
+        if not -1 <= self.min_verification <= 1:
+            raise ValueError(f"fusion: min_verification must be in [-1, 1], got {self.min_verification}")
+
+
+def cluster(distance: np.ndarray, cut: float) -> np.ndarray:
+    """Hierarchical clustering with average linkage.
+
+    Average linkage merges two clusters by the mean over all their pairs: single linkage would chain neighbouring
+    objects through stray hypotheses between them, and complete linkage would split an object by its worst hypothesis.
+
+    Args:
+        distance: (k, k) symmetric, metres.
+        cut: metres; clusters whose mean distance is above it stay apart.
+
+    Returns:
+        (k,) cluster of each item, from 0.
+    """
+    if len(distance) < 2:
+        return np.zeros(len(distance), int)
+    return fcluster(linkage(squareform(distance, checks=False), "average"), cut, "distance") - 1
+
+
+def select(labels: np.ndarray, positions: np.ndarray, exclusion: float) -> np.ndarray:
+    """The best of each cluster that shares its place with no better one.
+
+    Args:
+        labels: (k,) clusters of hypotheses in order of preference, best first.
+        positions: (k, 3) metres.
+        exclusion: metres.
+
+    Returns:
+        (n,) indices, best first.
+    """
+    best = np.sort(np.unique(labels, return_index=True)[1])
+    apart = np.linalg.norm(positions[best][:, None] - positions[best][None], axis=-1) >= exclusion
+    kept = np.ones(len(best), bool)
+    for index in range(1, len(best)):
+        kept[index] = apart[index, :index][kept[:index]].all()
+    return best[kept]
+
+
+def preference(verification: np.ndarray, T_world_object: np.ndarray) -> np.ndarray:
+    """(k,) indices by falling verification score; ties by pose, so that the order of arrival never matters."""
+    entries = T_world_object[:, :3].reshape(len(verification), 12)
+    return np.lexsort([*entries.T, -verification])
+
+
+def project_features(
+    views: ModelViews, T_camera_object: np.ndarray, camera: PinholeCamera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Box and depth that objects would have in a camera if nothing hid them.
+
+    Args:
+        views: the object's precomputed views.
+        T_camera_object: (n, 4, 4).
+        camera: intrinsics.
+
+    Returns:
+        (n, 4) boxes, normalised and clipped to the image, and (n,) mean depths of the visible surface, metres.
+    """
+    R, t = T_camera_object[:, :3, :3], T_camera_object[:, :3, 3]
+    outline = views.outline @ np.swapaxes(R, 1, 2) + t[:, None]
+    outline[..., 2] = np.maximum(outline[..., 2], 1e-3)
+    uv = (project(outline, camera) + 0.5) / (camera.width, camera.height)
+    box = np.concatenate([uv.min(axis=1), uv.max(axis=1)], axis=1).clip(0.0, 1.0)
+    centroid = views.centroids[views.nearest_direction(T_camera_object)]
+    return box, np.einsum("nj,nj->n", R[:, 2], centroid) + t[:, 2]
+
+
+class SceneFusion:
+    """Accumulates the hypotheses of views and says what objects they amount to.
+
+    Results depend on the set of views only, not on their order; a view that is known already adds nothing.
+    """
+
+    def __init__(self, model: ObjectModel, parameters: FusionParameters | None = None) -> None:
+        self.parameters = parameters or FusionParameters()
+        self._diameter = model.diameter
+        self._distance = SymmetricDistance(model)
+        self._views = model_views(model)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all views."""
+        self._stamps: set[int] = set()
+        self._stamp = np.zeros(0, np.int64)
+        self._T_world_object = np.zeros((0, 4, 4))
+        # verification, score, box (4), depth
+        self._table = np.zeros((0, 7))
+        self._distances = np.zeros((0, 0))
+
+    def forget_before(self, stamp: int) -> None:
+        """Forget the views older than ``stamp`` in nanoseconds."""
+        kept = self._stamp >= stamp
+        self._stamps = {known for known in self._stamps if known >= stamp}
+        self._stamp, self._T_world_object, self._table = self._stamp[kept], self._T_world_object[kept], self._table[kept]
+        self._distances = self._distances[np.ix_(kept, kept)]
+
+    def add_view(
+        self, stamp: int, T_world_camera: np.ndarray, hypotheses: Hypotheses, verification: np.ndarray
+    ) -> bool:
+        """Take in the hypotheses of one view.
+
+        Args:
+            stamp: nanoseconds; identifies the view.
+            T_world_camera: (4, 4).
+            hypotheses: k hypotheses.
+            verification: (k,) their verification scores (equation 1).
+
+        Returns:
+            False when the view was known, and nothing was added.
+
+        Raises:
+            ValueError: another number of scores than of hypotheses.
+        """
+        if len(verification) != len(hypotheses):
+            raise ValueError(f"fusion: {len(verification)} verification scores for {len(hypotheses)} hypotheses")
+        if stamp in self._stamps:
+            return False
+        T = T_world_camera @ hypotheses.T_camera_object
+        known, own = self._distance.between(T, self._T_world_object), self._distance.between(T, T)
+        self._distances = np.block([[self._distances, known.T], [known, own]])
+        row = np.column_stack([verification, hypotheses.score, hypotheses.box, hypotheses.depth])
+        self._stamps.add(stamp)
+        self._stamp = np.append(self._stamp, np.full(len(T), stamp))
+        self._T_world_object = np.concatenate([self._T_world_object, T])
+        self._table = np.concatenate([self._table, row])
+        return True
+
+    def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
+        """The accumulated objects, best verified first, with features in the camera of view ``stamp``.
+
+        An object hypothesised in that view has the box and depth of its own mask there (of the best verified
+        hypothesis in its cluster); for the others they are projected from the pose.
+        """
+        order = preference(self._table[:, 0], self._T_world_object)
+        order = order[self._table[order, 0] >= self.parameters.min_verification]
+        if not len(order):
+            return SceneObjects.empty()
+        T, table, stamps = self._T_world_object[order], self._table[order], self._stamp[order]
+        distance = self._distances[np.ix_(order, order)]
+        labels = cluster(distance, self.parameters.cut * self._diameter)
+        chosen = select(labels, T[:, :3, 3], self.parameters.exclusion * self._diameter)
+        box, depth = project_features(self._views, invert(T_world_camera) @ T[chosen], camera)
+        support, spread = np.zeros(len(chosen), int), np.zeros(len(chosen))
+        for row, survivor in enumerate(chosen):
+            members = np.flatnonzero(labels == labels[survivor])
+            support[row] = len(np.unique(stamps[members]))
+            spread[row] = distance[np.ix_(members, members)].max()
+            current = members[stamps[members] == stamp]
+            if len(current):
+                box[row], depth[row] = table[current[0], 2:6], table[current[0], 6]
+        return SceneObjects(T[chosen], table[chosen, 0], table[chosen, 1], box, depth, support, spread)

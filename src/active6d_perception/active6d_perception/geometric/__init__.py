@@ -1,0 +1,1 @@
+"""The training-free estimator: point-pair voting and registration on depth alone."""

@@ -1,0 +1,89 @@
+"""Depth image to smoothed points, normals and a mask of what may be an object (not table, floor or bin wall)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from active6d_core.camera import PinholeCamera, backproject, normals_from_points
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The measured surface of one view, in the optical frame.
+
+    Attributes:
+        camera: intrinsics of all images.
+        depth: (H, W) smoothed metres, NaN invalid.
+        points: (H, W, 3) metres, NaN invalid.
+        normals: (H, W, 3) unit normals facing the camera, NaN where unknown.
+        foreground: (H, W) bool, has depth and lies on no large plane.
+    """
+
+    camera: PinholeCamera
+    depth: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    foreground: np.ndarray
+
+
+def measure_surface(depth: np.ndarray, camera: PinholeCamera, object_diameter: float) -> Surface:
+    """Smooth a depth image within surfaces, not across edges, and set the bin and the table aside.
+
+    Args:
+        depth: (H, W) metres, NaN invalid.
+        camera: intrinsics.
+        object_diameter: metres; a plane is background when it is larger than any object's face could be.
+    """
+    filled = np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0)
+    smooth = cv2.bilateralFilter(filled, d=5, sigmaColor=0.006, sigmaSpace=2.0)
+    smooth[filled <= 0] = np.nan
+    points = backproject(smooth, camera)
+    normals = normals_from_points(points, reach=3)
+    foreground = np.isfinite(smooth)
+    for normal, offset in find_large_planes(points, normals, object_diameter):
+        # Only what lies flat on the plane: a wall's plane, extended, cuts through objects.
+        foreground &= ~((np.abs(points @ normal - offset) < 0.006) & (normals @ normal > 0.8))
+    return Surface(camera, smooth, points, normals, foreground)
+
+
+def find_large_planes(points: np.ndarray, normals: np.ndarray, object_diameter: float) -> list[tuple[np.ndarray, float]]:
+    """Planes that hold more surface than an object's largest possible face, biggest first (sequential RANSAC, seeded).
+
+    One sample is a point with its normal, so a plane needs a single good draw.
+
+    Args:
+        points: (H, W, 3) metres.
+        normals: (H, W, 3) facing the camera, NaN unknown.
+        object_diameter: metres.
+
+    Returns:
+        (unit normal float32 facing the camera, offset) pairs with ``normal . x = offset`` on the plane.
+    """
+    cell = points[::8, ::8].reshape(-1, 3), normals[::8, ::8].reshape(-1, 3)
+    known = np.isfinite(cell[1]).all(axis=1) & np.isfinite(cell[0]).all(axis=1)
+    p, n = cell[0][known], cell[1][known]
+    rng = np.random.default_rng(0)
+    planes: list[tuple[np.ndarray, float]] = []
+    for _ in range(6):
+        if len(p) < 50:
+            break
+        draws = rng.choice(len(p), size=min(200, len(p)), replace=False)
+        near = np.abs(p @ n[draws].T - np.einsum("di,di->d", p[draws], n[draws])) < 0.008
+        aligned = n @ n[draws].T > 0.9
+        members = near & aligned
+        best = members[:, members.sum(axis=0).argmax()]
+        for _ in range(3):
+            centre = p[best].mean(axis=0)
+            normal = np.linalg.svd(p[best] - centre, full_matrices=False)[2][2]
+            normal = normal if normal @ centre < 0 else -normal
+            best = (np.abs((p - centre) @ normal) < 0.006) & (n @ normal > 0.9)
+            if best.sum() < 20:
+                break
+        if best.sum() < 20:
+            break
+        spread = np.ptp(p[best] @ np.linalg.svd(p[best] - p[best].mean(axis=0), full_matrices=False)[2][:2].T, axis=0)
+        if spread[0] > 1.8 * object_diameter:
+            planes.append((normal.astype(np.float32), float(normal @ centre)))
+        p, n = p[~best], n[~best]
+    return planes

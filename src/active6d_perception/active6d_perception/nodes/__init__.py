@@ -1,0 +1,1 @@
+"""ROS 2 nodes; every calculation is in the modules beside this package."""

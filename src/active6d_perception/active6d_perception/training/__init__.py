@@ -1,0 +1,1 @@
+"""Training of the learned estimator: stored training views, losses, the loop, validation and curves."""
