@@ -75,3 +75,12 @@ def test_spheres_with_equal_grids_are_equal():
     assert ViewSphere() == SPHERE
     assert ViewSphere(radius=0.5) != SPHERE
     assert len({ViewSphere(), SPHERE}) == 1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"radius": 0.0}, {"radius": np.nan}, {"azimuths": 0}, {"elevations_degrees": ()}, {"elevations_degrees": (-5.0,)}],
+)
+def test_a_sphere_without_views_or_below_the_table_is_refused(wrong):
+    with pytest.raises(ValueError, match="view sphere"):
+        ViewSphere(**wrong)

@@ -17,6 +17,9 @@ class ViewSphere:
         radius: metres from the world's origin.
         elevations_degrees: levels of the grid, above the horizon.
         azimuths: number of evenly spaced azimuths, the first at world +x.
+
+    Raises:
+        ValueError: a radius or number that is not positive, or an elevation outside [0, 90].
     """
 
     radius: float = 0.8
@@ -26,6 +29,10 @@ class ViewSphere:
     """(M, 3) camera positions in the world, metres."""
 
     def __post_init__(self) -> None:
+        if not 0 < self.radius < np.inf or self.azimuths < 1 or not self.elevations_degrees:
+            raise ValueError(f"view sphere: radius and number of views must be positive, got {self}")
+        if not all(0 <= elevation <= 90 for elevation in self.elevations_degrees):
+            raise ValueError(f"view sphere: elevations must be within [0, 90], got {self.elevations_degrees}")
         elevation, azimuth = np.meshgrid(
             np.radians(self.elevations_degrees),
             np.arange(self.azimuths) * 2 * np.pi / self.azimuths,

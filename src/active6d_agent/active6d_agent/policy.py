@@ -1,0 +1,162 @@
+"""What a policy sees, what it decides, and how policies are found by name.
+
+A policy needs nothing that a robot does not have: the fused objects, where the camera has been, which views it may
+take, and what is left of its budget (paper, "Problem definition"). The node, the environment and the evaluation all
+speak to policies through this module.
+"""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.object_model import ObjectModel
+from active6d_core.view_sphere import ViewSphere
+
+#: A view of the grid counts as visited when the camera was this close to it, metres of arc.
+VISITED_WITHIN = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What is known after t moves.
+
+    Attributes:
+        objects: the n accumulated objects, their boxes and depths in the current camera.
+        positions: (t + 1, 3) camera positions in the world so far, the current one last, metres.
+        sphere: the grid of views.
+        allowed: (M,) bool, views of the grid that the camera can reach.
+        steps_left: moves left, at least 1.
+        metres_left: arc left on the sphere, ``inf`` without such a budget.
+    """
+
+    objects: SceneObjects
+    positions: np.ndarray
+    sphere: ViewSphere
+    allowed: np.ndarray
+    steps_left: int
+    metres_left: float = np.inf
+
+    @property
+    def steps(self) -> int:
+        """The budget T of the episode in moves."""
+        return len(self.positions) - 1 + self.steps_left
+
+    def visited(self) -> np.ndarray:
+        """(M,) bool, views of the grid that the camera has taken."""
+        arcs = self.sphere.arc(self.sphere.positions[:, None], self.positions[None])
+        return arcs.min(axis=1) < VISITED_WITHIN
+
+    def candidates(self) -> np.ndarray:
+        """(M,) bool, views that may be next: reachable, not visited, within the metres left."""
+        affordable = self.sphere.arc(self.sphere.positions, self.positions[-1]) <= self.metres_left
+        return self.allowed & affordable & ~self.visited()
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """Where the camera should go, and why.
+
+    Attributes:
+        position: (3,) goal on the sphere in the world, metres; the current position when stopping.
+        view: index of the goal in the grid, None when it lies off the grid or the episode stops.
+        attention: (n,) weight of each object, summing to one (for n > 0).
+        attended: index of the object that the move is for, None when the policy looks at no one object.
+        stop: end the episode here instead of moving.
+    """
+
+    position: np.ndarray
+    view: int | None
+    attention: np.ndarray
+    attended: int | None = None
+    stop: bool = False
+
+    @classmethod
+    def go_to(
+        cls, observation: Observation, view: int, attention: np.ndarray | None = None, attended: int | None = None
+    ) -> "Decision":
+        """Move to a view of the grid; without ``attention`` all objects weigh the same."""
+        if attention is None:
+            attention = uniform_attention(len(observation.objects))
+        return cls(observation.sphere.positions[view], int(view), attention, attended)
+
+    @classmethod
+    def stop_here(cls, observation: Observation) -> "Decision":
+        """End the episode at the current view."""
+        return cls(observation.positions[-1], None, uniform_attention(len(observation.objects)), stop=True)
+
+
+class Policy(Protocol):
+    """Chooses the next view."""
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin an episode; ``rng`` is the only source of randomness until the next one."""
+
+    def decide(self, observation: Observation) -> Decision:
+        """The next move; a policy stops when the observation leaves it no candidate."""
+
+
+_PolicyFactory = TypeVar("_PolicyFactory", bound=Callable[..., Policy])
+_registry: dict[str, Callable[..., Policy]] = {}
+# Where the project's own policies live, so that a baseline does not have to wait for torch.
+_MODULES = {
+    "active6d_agent.baselines": ("random", "unidirectional", "max-distance", "lowest-score", "single-view", "entropy"),
+}
+
+
+def register_policy(name: str) -> Callable[[_PolicyFactory], _PolicyFactory]:
+    """Decorator that makes ``factory(model, **parameters)`` available as ``create_policy(name, ...)``."""
+
+    def register(factory: _PolicyFactory) -> _PolicyFactory:
+        _registry[name] = factory
+        return factory
+
+    return register
+
+
+def list_policies() -> list[str]:
+    """Names of all policies."""
+    return sorted({*_registry, *(name for names in _MODULES.values() for name in names)})
+
+
+def create_policy(name: str, model: ObjectModel, **parameters: Any) -> Policy:
+    """Make a policy by name.
+
+    Args:
+        name: one of :func:`list_policies`.
+        model: the object that fills the bin.
+        parameters: of that policy; its class documents them.
+
+    Raises:
+        ValueError: no such policy, no such parameter, or a value out of range; the message names it.
+    """
+    for module, names in _MODULES.items():
+        if name in names:
+            import_module(module)
+    if name not in _registry:
+        raise ValueError(f"unknown policy '{name}'; known: {', '.join(list_policies())}")
+    factory = _registry[name]
+    accepted = [item for item in inspect.signature(factory).parameters if item != "model"]
+    unknown = sorted(parameters.keys() - set(accepted))
+    if unknown:
+        known = ", ".join(accepted) if accepted else "none"
+        raise ValueError(f"policy '{name}' has no parameter '{unknown[0]}'; it has: {known}")
+    try:
+        return factory(model, **parameters)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"policy '{name}': {error}") from error
+
+
+def uniform_attention(count: int) -> np.ndarray:
+    """(n,) equal weights that sum to one."""
+    return np.full(count, 1.0 / max(count, 1))
+
+
+def softmax(logits: np.ndarray) -> np.ndarray:
+    """(n,) logits to (n,) weights that sum to one; empty in, empty out."""
+    weights = np.exp(logits - logits.max(initial=-np.inf))
+    return weights / weights.sum() if len(weights) else weights

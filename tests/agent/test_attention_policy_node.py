@@ -1,0 +1,249 @@
+"""The policy node: an episode by hand, budgets, repeats and restarts, and everything that may come in wrong."""
+
+import array
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import PointCloud2
+
+from active6d_agent.nodes.attention_policy import AttentionPolicyNode
+from active6d_core.conversions import (
+    attention_from_cloud,
+    make_header,
+    objects_to_cloud,
+    pose_stamped_to_transform,
+    stamp_to_ns,
+    transform_to_pose,
+)
+from active6d_core.view_sphere import ViewSphere
+
+SPHERE = ViewSphere()
+SECOND = 1_000_000_000
+
+
+class Episode:
+    """Plays camera and fusion: sends views, collects what the policy says."""
+
+    def __init__(self, graph, make_objects, **overrides):
+        self.graph = graph
+        self.objects = make_objects([[0.1, 0, 0], [-0.1, 0, 0.05]], [0.9, 0.3])
+        self.goals = graph.mailbox(PoseStamped, "view_goal")
+        self.attention = graph.mailbox(PointCloud2, "attention")
+        self.ends = graph.mailbox(DiagnosticArray, "episode/end", latched=True)
+        self.diagnostics = graph.mailbox(DiagnosticArray, "/diagnostics")
+        self.node = graph.add(AttentionPolicyNode(context=graph.context, overrides=overrides))
+        outputs = (self.node.goal, self.node.attention, self.node.end)
+        graph.spin_until(lambda: all(output.get_subscription_count() for output in outputs))
+        self.stamp = 0
+
+    def start(self, stamp):
+        announcement = DiagnosticArray(header=make_header(stamp, "world"), status=[DiagnosticStatus(name="episode")])
+        self.graph.publish("episode/start", announcement, latched=True)
+
+    def pose(self, view, stamp):
+        message = PoseStamped(header=make_header(stamp, "world"))
+        message.pose = transform_to_pose(SPHERE.pose(SPHERE.positions[view]))
+        self.graph.publish("camera/pose", message, latched=True)
+
+    def view(self, view, stamp=None):
+        self.stamp = self.stamp + SECOND if stamp is None else stamp
+        self.pose(view, self.stamp)
+        self.graph.publish("objects", objects_to_cloud(self.objects, self.stamp, "world"))
+
+    def goal_views(self):
+        return [SPHERE.nearest(pose_stamped_to_transform(goal, "world")[:3, 3]) for goal in self.goals]
+
+    def run(self, view):
+        """Follow the goals until the episode ends; returns the views taken."""
+        views, ends = [view], len(self.ends)
+        while True:
+            goals = len(self.goals)
+            self.view(views[-1])
+            self.graph.spin_until(lambda goals=goals: len(self.goals) > goals or len(self.ends) > ends)
+            if len(self.ends) > ends:
+                return views
+            views.append(self.goal_views()[-1])
+
+    def errors(self):
+        return [s.message for message in self.diagnostics for s in message.status if s.level == DiagnosticStatus.ERROR]
+
+
+@pytest.fixture
+def episode(graph, make_objects):
+    return lambda **overrides: Episode(graph, make_objects, **{"policy": "lowest-score", "steps": 2, **overrides})
+
+
+def test_an_episode_of_two_moves(episode):
+    played = episode()
+    played.start(SECOND)
+    views = played.run(40)
+    assert len(views) == 3
+    assert [stamp_to_ns(goal.header.stamp) for goal in played.goals] == [SECOND, 2 * SECOND]
+    for goal, view in zip(played.goals, views[1:], strict=True):
+        np.testing.assert_allclose(
+            pose_stamped_to_transform(goal, "world"), SPHERE.pose(SPHERE.positions[view]), atol=1e-9
+        )
+    end = played.ends[0]
+    assert stamp_to_ns(end.header.stamp) == 3 * SECOND
+    assert end.status[0].message == "budget of 2 moves spent"
+    values = {value.key: value.value for value in end.status[0].values}
+    assert values["moves"] == "2"
+    assert float(values["metres"]) == pytest.approx(SPHERE.path_length(SPHERE.positions[views]), abs=1e-6)
+    played.graph.spin_until(lambda: len(played.attention) == 2)
+    weights, attended = attention_from_cloud(played.attention[0], "world")
+    assert attended == 1
+    assert weights[1] > weights[0]
+    assert played.errors() == []
+
+
+def test_the_seed_decides(episode, graph, make_objects):
+    paths = []
+    for seed in (3, 3, 4):
+        played = Episode(graph, make_objects, policy="random", steps=4, seed=seed)
+        paths.append(played.run(0))
+        graph.remove(played.node)
+    assert paths[0] == paths[1] != paths[2]
+
+
+def test_a_repeated_view_repeats_the_goal(episode):
+    played = episode()
+    played.view(10)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+    played.view(10, played.stamp)
+    played.graph.spin_until(lambda: len(played.goals) == len(played.attention) == 2)
+    assert played.goals[0] == played.goals[1]
+    assert played.attention[0] == played.attention[1]
+    assert played.errors() == []
+
+
+def test_the_next_episode_begins_afresh(episode):
+    played = episode()
+    played.start(SECOND)
+    first = played.run(40)
+    played.start(played.stamp + SECOND)
+    assert played.run(40) == first
+    assert len(played.ends) == 2
+
+
+def test_a_first_view_that_overtakes_the_start_is_decided_on_again(episode):
+    played = episode(steps=1)
+    played.start(SECOND)
+    played.run(40)
+    played.view(41, 10 * SECOND)
+    played.start(10 * SECOND)
+    played.graph.spin_until(lambda: len(played.goals) == 2)
+    assert stamp_to_ns(played.goals[1].header.stamp) == 10 * SECOND
+
+
+def test_the_reach_is_respected(episode):
+    reach = {"reach_elevation_min_degrees": 40.0, "reach_azimuth_degrees": 90.0, "reach_sector_degrees": 120.0}
+    played = episode(policy="random", steps=6, **reach)
+    azimuth, elevation = np.degrees(SPHERE.angles(SPHERE.positions[played.run(60)[1:]])).T
+    assert (elevation > 40).all()
+    assert ((azimuth >= 30) & (azimuth <= 150)).all()
+
+
+def test_listed_views_then_no_reachable_view_is_left(episode):
+    played = episode(policy="max-distance", steps=6, reach_views=[7, 9])
+    assert sorted(played.run(0)[1:]) == [7, 9]
+    assert played.ends[0].status[0].message == "no reachable view is left"
+
+
+def test_metres_are_a_budget(episode):
+    played = episode(policy="max-distance", steps=20, metres=2.5)
+    assert SPHERE.path_length(SPHERE.positions[played.run(0)]) <= 2.5
+    assert played.ends[0].status[0].message == "no reachable view is left"
+
+
+def wrong_frame(cloud):
+    cloud.header.frame_id = "map"
+
+
+def cut_short(cloud):
+    cloud.data = cloud.data[:-4]
+
+
+def lost_column(cloud):
+    cloud.fields = cloud.fields[1:]
+
+
+def not_a_number(cloud):
+    cloud.data[0:4] = array.array("B", np.float32(np.nan).tobytes())
+
+
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (wrong_frame, "frame_id is 'map'"),
+        (cut_short, "bytes"),
+        (lost_column, "column 'x'"),
+        (not_a_number, "finite"),
+    ],
+)
+def test_bad_objects_are_refused_and_the_node_lives(episode, damage, complaint):
+    played = episode()
+    cloud = objects_to_cloud(played.objects, SECOND, "world")
+    damage(cloud)
+    played.pose(3, SECOND)
+    played.graph.publish("objects", cloud)
+    played.graph.spin_until(lambda: any(complaint in error for error in played.errors()), what=complaint)
+    assert not played.goals
+    played.view(3, SECOND)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+
+
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (lambda message: setattr(message.header, "frame_id", "map"), "frame_id is 'map'"),
+        (lambda message: setattr(message.pose.position, "x", float("nan")), "finite"),
+        (lambda message: setattr(message.pose.orientation, "w", 5.0), "quaternion"),
+    ],
+)
+def test_bad_poses_are_refused_and_the_node_lives(episode, damage, complaint):
+    played = episode()
+    message = PoseStamped(header=make_header(SECOND, "world"))
+    message.pose = transform_to_pose(SPHERE.pose(SPHERE.positions[3]))
+    damage(message)
+    played.graph.publish("camera/pose", message, latched=True)
+    played.graph.spin_until(lambda: any(complaint in error for error in played.errors()), what=complaint)
+    played.view(3, SECOND)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+
+
+def test_a_stale_view_is_refused(episode):
+    played = episode(steps=4)
+    played.view(3, 5 * SECOND)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+    played.view(4, 2 * SECOND)
+    played.graph.spin_until(lambda: any("stale" in error for error in played.errors()))
+    played.view(4, 6 * SECOND)
+    played.graph.spin_until(lambda: len(played.goals) == 2)
+
+
+def test_an_empty_scene_still_moves(episode, make_objects):
+    played = episode()
+    played.objects = make_objects()
+    assert len(played.run(0)) == 3
+    assert all(cloud.width == 0 for cloud in played.attention)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"policy": "clever"}, "parameter 'policy' is 'clever'"),
+        ({"steps": -1}, "parameter 'steps' is -1"),
+        ({"policy_parameters": "[1]"}, "parameter 'policy_parameters' must be a YAML mapping"),
+        ({"policy_parameters": "{a: ["}, "parameter 'policy_parameters'"),
+        ({"policy_parameters": "{sigma: 1}"}, "policy 'lowest-score' has no parameter 'sigma'"),
+        ({"object": "teapot"}, "unknown object 'teapot'"),
+        ({"reach_views": [100]}, "parameter 'reach_views' must be within 0 and 99"),
+        ({"reach_elevation_min_degrees": 80.0}, "leave no view"),
+        ({"elevations_degrees": [-10.0]}, "elevations must be within"),
+    ],
+)
+def test_bad_parameters_are_named(graph, overrides, message):
+    with pytest.raises(ValueError, match=message):
+        graph.add(AttentionPolicyNode(context=graph.context, overrides=overrides))
