@@ -220,7 +220,8 @@ def _episode(folder: Path, messages: dict, latencies: dict, start: int, limit: i
 
     world = messages[POSE][start].header.frame_id
     truth, ends = within("ground_truth/poses"), within(END)
-    statuses = [status for message in (*within(START), *ends) for status in message.status]
+    # The camera's word comes last: both sides say their seed, and the camera's is the one of the heap.
+    statuses = [status for message in (*ends, *within(START)) for status in message.status]
     return EpisodeRecord(
         folder=folder,
         info={pair.key: pair.value for status in statuses for pair in status.values},

@@ -68,6 +68,8 @@ CONTRACT = (
     RecordedTopic("episode/end", "diagnostic_msgs/msg/DiagnosticArray", Per.EPISODE, latched=True),
     RecordedTopic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", Per.WHENEVER, depth=100),
 )
+#: Key of the nodes' settings among the custom data of metadata.yaml.
+SETTINGS = "active6d_settings"
 START, END, POSE = "episode/start", "episode/end", "camera/pose"
 
 
@@ -81,17 +83,19 @@ class EpisodeWriter:
     Args:
         folder: must not exist; its parents may.
         names: topic of the contract to the name it has in the bag (resolved against namespace and remaps).
+        settings: what the nodes were told, as JSON; kept in metadata.yaml so that a replay can tell them the same.
 
     Raises:
         RecordingError: the folder exists, or cannot be made.
     """
 
-    def __init__(self, folder: Path, names: dict[str, str]) -> None:
+    def __init__(self, folder: Path, names: dict[str, str], settings: str = "{}") -> None:
         self.folder = folder
         if folder.exists():
             raise RecordingError(f"{folder} exists already; name a new folder for the bag or remove this one")
         self._writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer.set_custom_data(SETTINGS, settings)
         try:
             self._writer.open()
         except OSError as error:

@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from active6d_bringup.recording import CONTRACT, EpisodeWriter, RecordedTopic, describe_missing
+from active6d_bringup.recording import CONTRACT, END, EpisodeWriter, Per, RecordedTopic, describe_missing
 from active6d_core.node import GraphNode, run_node
 
 
@@ -26,8 +26,10 @@ class EpisodeRecorderNode(GraphNode):
         self._latched_camera = self.declare(
             "latched_camera", True, "the camera keeps its last view (transient-local); false for drivers that do not"
         )
+        self._settings = self.declare("settings", "{}", "what the other nodes were told, JSON, kept in metadata.yaml")
         self._writer: EpisodeWriter | None = None
         self._subscriptions_by_topic = {topic.name: self._subscribe(topic) for topic in CONTRACT}
+        self.create_service(Trigger, "~/connected", self._answer_connected)
         self.create_service(Trigger, "~/complete", self._answer_complete)
 
     def setup(self) -> None:
@@ -40,7 +42,7 @@ class EpisodeRecorderNode(GraphNode):
         if not self._folder:
             raise ValueError("episode_recorder: parameter 'bag' must name a folder to create")
         names = {topic: subscription.topic_name for topic, subscription in self._subscriptions_by_topic.items()}
-        self._writer = EpisodeWriter(Path(self._folder).expanduser(), names)
+        self._writer = EpisodeWriter(Path(self._folder).expanduser(), names, self._settings)
         self.get_logger().info(f"recording into {self._folder}")
 
     def teardown(self) -> None:
@@ -48,7 +50,8 @@ class EpisodeRecorderNode(GraphNode):
         if self._writer is not None:
             self.drain()
             self._writer.close()
-            self.get_logger().info(f"{self._writer.message_count} messages in {self._folder}")
+            if self.context.ok():
+                self.get_logger().info(f"{self._writer.message_count} messages in {self._folder}")
             self._writer = None
 
     def destroy_node(self) -> None:
@@ -81,12 +84,24 @@ class EpisodeRecorderNode(GraphNode):
         if self._writer is not None:
             self._writer.write(topic, payload, self.get_clock().now().nanoseconds)
 
+    def _answer_connected(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Whether every topic that the graph cannot do without has a publisher that this node has found."""
+        needed = [topic.name for topic in CONTRACT if topic.per is not Per.WHENEVER]
+        alone = [topic for topic in needed if not self._subscriptions_by_topic[topic].get_publisher_count()]
+        response.success = not alone
+        response.message = f"no publisher of {', '.join(alone)}" if alone else "connected"
+        return response
+
     def _answer_complete(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Whether the last episode that has ended is on record in full."""
-        end = self._writer.last_end if self._writer else None
-        missing = ["episode/end"] if end is None else self._writer.missing(end)
+        if self._writer is None:
+            response.message = "not recording"
+            return response
+        end = self._writer.last_end
+        missing = [END] if end is None else self._writer.missing(end)
         response.success = not missing
-        response.message = describe_missing(missing) if missing else "complete"
+        state = f"no answer from {describe_missing(missing)}" if missing else "complete"
+        response.message = f"{self._writer.message_count} messages, {state}"
         return response
 
 

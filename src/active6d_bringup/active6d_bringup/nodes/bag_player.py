@@ -1,0 +1,115 @@
+"""Stands in for the camera: publishes the views of a recorded episode again."""
+
+from collections import defaultdict
+from importlib import import_module
+from pathlib import Path
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.timer import Timer
+from sensor_msgs.msg import PointCloud2
+
+from active6d_bringup.bag import BagError, open_bag, topic_names
+from active6d_bringup.recording import CAMERA_TOPICS, CONTRACT, END, stamp_of
+from active6d_core.conversions import make_header, stamp_to_ns
+from active6d_core.node import GraphNode, run_node
+
+_REPLAYED = (*CAMERA_TOPICS, *(topic for topic in CONTRACT if topic.name in ("episode/start", "ground_truth/poses")))
+
+
+class BagPlayerNode(GraphNode):
+    """Publishes what the camera said, view by view and byte by byte, then ``episode/end``.
+
+    With ``rate`` 0 the next view goes out when ``objects`` of the last one have arrived; otherwise when as much time has
+    passed as in the recording, divided by ``rate``.
+    """
+
+    def __init__(self, **arguments) -> None:
+        super().__init__("bag_player", **arguments)
+        self._folder = self.declare("bag", "", "folder of the bag to play")
+        self._rate = self.declare(
+            "rate", 0.0, "speed against the recording's; 0 waits for the objects of each view instead", minimum=0.0
+        )
+        self._publishers = {}
+        for topic in _REPLAYED:
+            package, _, name = topic.type.split("/")
+            message_type = getattr(import_module(f"{package}.msg"), name)
+            self._publishers[topic.name] = self.output(message_type, topic.name, latched=True)
+        self._end = self.output(DiagnosticArray, END, latched=True)
+        self.input(PointCloud2, "objects", self._on_objects)
+        self._timer: Timer | None = None
+
+    def setup(self) -> None:
+        """Read the bag.
+
+        Raises:
+            BagError: it cannot be read, or has no complete view.
+        """
+        if not self._folder:
+            raise ValueError("bag_player: parameter 'bag' must name the folder of a bag")
+        self._views, self._received = _read_views(Path(self._folder).expanduser())
+        self._stamps = sorted(self._views)
+        self._next = 0
+
+    def begin(self) -> None:
+        """Publish the first view."""
+        self._publish_next()
+
+    def teardown(self) -> None:
+        """Stop playing."""
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+            self._timer = None
+
+    def _on_objects(self, message: PointCloud2) -> None:
+        if self._rate == 0 and stamp_to_ns(message.header.stamp) == self._stamps[self._next - 1]:
+            self._publish_next()
+
+    def _publish_next(self) -> None:
+        self.teardown()
+        if self._next == len(self._stamps):
+            status = DiagnosticStatus(level=DiagnosticStatus.OK, name="episode", message="end of the bag")
+            self._end.publish(DiagnosticArray(header=make_header(self._stamps[-1], self.world_frame), status=[status]))
+            self._next += 1
+            return
+        if self._next > len(self._stamps):
+            return
+        stamp = self._stamps[self._next]
+        with self.measure(stamp):
+            for topic, payload in self._views[stamp].items():
+                self._publishers[topic].publish(payload)
+        self._next += 1
+        if self._rate > 0:
+            following = self._stamps[min(self._next, len(self._stamps) - 1)]
+            pause = (self._received[following] - self._received[stamp]) * 1e-9 / self._rate
+            self._timer = self.create_timer(max(pause, 0.0), self._publish_next)
+
+
+def _read_views(folder: Path) -> tuple[dict[int, dict[str, bytes]], dict[int, int]]:
+    """Per complete view's stamp: its serialized messages by topic, and when (ns) its pose was recorded."""
+    types = {topic.name: topic.type for topic in _REPLAYED}
+    views: dict[int, dict[str, bytes]] = defaultdict(dict)
+    received: dict[int, int] = {}
+    with open_bag(folder) as reader:
+        names = topic_names(reader.connections, folder)
+        wanted = [item for item in reader.connections if names.get(item.topic) in types]
+        for connection, timestamp, payload in reader.messages(wanted):
+            topic = names[connection.topic]
+            stamp = stamp_of(types[topic], payload)
+            views[stamp][topic] = bytes(payload)
+            if topic == "camera/pose":
+                received[stamp] = timestamp
+    complete = {
+        stamp: messages for stamp, messages in views.items() if all(topic.name in messages for topic in CAMERA_TOPICS)
+    }
+    if not complete:
+        raise BagError(f"{folder}: holds no complete view (color, depth, camera_info and pose of one stamp)")
+    return complete, received
+
+
+def main() -> None:
+    """Entry point."""
+    run_node(BagPlayerNode)
+
+
+if __name__ == "__main__":
+    main()

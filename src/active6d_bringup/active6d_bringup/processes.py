@@ -1,0 +1,170 @@
+"""The same graph with every node in an operating system process of its own, supervised."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from active6d_bringup.composition import NODES, GraphDescription, OnEvent, open_context
+
+#: Nodes that an episode survives: they find their inputs again as latched messages.
+RESTARTED = ("attention_policy", "hypothesis_fusion", "pose_estimator")
+_RESTARTS = 5
+_START_SECONDS = 60.0
+_STOP_SECONDS = 15.0
+
+
+class ProcessError(RuntimeError):
+    """A node's process ended or did not answer; the text names it."""
+
+
+class ProcessGraph:
+    """One process a node. A node that dies is reported, and started again if the episode can survive that.
+
+    No process outlives this one: they are ended by :meth:`close`, and by the kernel if this process is killed.
+    """
+
+    def __init__(self, description: GraphDescription, on_event: OnEvent = lambda text: None) -> None:
+        self._description = description
+        self._on_event = on_event
+        self.context = open_context(description)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self._node = Node(
+            "supervisor", context=self.context, namespace=description.namespace, use_global_arguments=False
+        )
+        self.executor.add_node(self._node)
+        self._guests: list[Node] = []
+        self.processes: dict[str, subprocess.Popen] = {}
+        self.restarts = dict.fromkeys(RESTARTED, 0)
+        self._started = False
+        self._complete = self._node.create_client(Trigger, "episode_recorder/complete")
+        self._recorded = None
+
+    def add(self, node: Node) -> None:
+        """Spin one more node of the caller's in this process."""
+        self._guests.append(node)
+        self.executor.add_node(node)
+
+    def start(self) -> None:
+        """Start every process, let them find each other, then configure and activate the nodes in order.
+
+        Raises:
+            ProcessError: a node ended, or did not come up within a minute.
+        """
+        for name in self._description.in_order():
+            self._on_event(f"starting {name}")
+            self._spawn(name, autostart=False)
+        clients = {
+            name: self._node.create_client(ChangeState, f"{name}/change_state") for name in self._description.in_order()
+        }
+        for name, client in clients.items():
+            self._wait(client.service_is_ready, f"{name} did not come up")
+        if "episode_recorder" in clients:
+            self._wait(self._recorder_connected, "episode_recorder did not find every topic of the graph")
+        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+            for name, client in clients.items():
+                self._change(name, client, transition)
+        self._started = True
+
+    def spin_once(self, timeout: float) -> None:
+        """Run one callback of this process and look after the others.
+
+        Raises:
+            ProcessError: a node ended that the episode cannot do without.
+        """
+        self.executor.spin_once(timeout_sec=timeout)
+        for name, process in list(self.processes.items()):
+            if process.poll() is not None:
+                self._bury(name, process.returncode)
+
+    def missing(self, stamp: int) -> list[str]:
+        """What the recorder's process still waits for."""
+        if "episode_recorder" not in self.processes:
+            return []
+        if self._recorded is None:
+            self._recorded = self._complete.call_async(Trigger.Request())
+        if not self._recorded.done():
+            return ["the recorder's answer"]
+        answer, self._recorded = self._recorded.result(), None
+        return [] if answer.success else [answer.message]
+
+    def close(self) -> None:
+        """Interrupt every process, the recorder last so that it sees all of them end; kill what does not listen."""
+        recorder = self.processes.pop("episode_recorder", None)
+        for group in ([*self.processes.values()], [recorder] if recorder else []):
+            _end(group)
+        for node in [*self._guests, self._node]:
+            self.executor.remove_node(node)
+            node.destroy_node()
+        self.executor.shutdown()
+        self.context.try_shutdown()
+
+    def _spawn(self, name: str, autostart: bool) -> None:
+        description = self._description
+        parameters = {**description.nodes[name], "autostart": autostart}
+        command = [sys.executable, "-m", NODES[name][0], *description.ros_arguments()]
+        if description.namespace:
+            command += ["-r", f"__ns:=/{description.namespace.strip('/')}"]
+        for key, value in parameters.items():
+            command += ["-p", f"{key}:={json.dumps(value)}"]
+        if setpriv := shutil.which("setpriv"):
+            command = [setpriv, "--pdeathsig", "TERM", *command]
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(description.domain_id())}
+        # Own process group: Ctrl-C reaches this process only, which then ends the others in order.
+        self.processes[name] = subprocess.Popen(command, env=environment, process_group=0)
+
+    def _bury(self, name: str, code: int) -> None:
+        cause = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        del self.processes[name]
+        if not self._started or code == 2 or name not in RESTARTED:
+            raise ProcessError(f"{name} ended ({cause}); see its own message above")
+        if self.restarts[name] == _RESTARTS:
+            raise ProcessError(f"{name} ended ({cause}) for the {_RESTARTS + 1}th time; giving up")
+        self.restarts[name] += 1
+        self._on_event(f"{name} died ({cause}), starting it again")
+        self._spawn(name, autostart=True)
+
+    def _wait(self, predicate: Callable[[], bool], failure: str) -> None:
+        deadline = time.monotonic() + _START_SECONDS
+        while not predicate():
+            if time.monotonic() > deadline:
+                raise ProcessError(f"{failure} within {_START_SECONDS:.0f} s")
+            self.spin_once(0.05)
+
+    def _recorder_connected(self) -> bool:
+        client = self._node.create_client(Trigger, "episode_recorder/connected")
+        try:
+            self._wait(client.service_is_ready, "episode_recorder did not come up")
+            answer = client.call_async(Trigger.Request())
+            self._wait(answer.done, "episode_recorder did not answer")
+            return answer.result().success
+        finally:
+            self._node.destroy_client(client)
+
+    def _change(self, name: str, client, transition: int) -> None:
+        answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        self._wait(answer.done, f"{name} did not answer")
+        if not answer.result().success:
+            raise ProcessError(f"{name} could not start; see its own message above")
+
+
+def _end(processes: list[subprocess.Popen]) -> None:
+    for process in processes:
+        process.send_signal(signal.SIGINT)
+    deadline = time.monotonic() + _STOP_SECONDS
+    for process in processes:
+        try:
+            process.wait(max(deadline - time.monotonic(), 0.1))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
