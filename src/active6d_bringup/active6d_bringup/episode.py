@@ -90,7 +90,10 @@ class EpisodeStep:
         index: 0 for the view before any move.
         stamp: nanoseconds.
         T_world_camera: (4, 4).
+        distance: metres of arc since the first view.
+        hypotheses: how many the estimator had for this view alone.
         objects: everything accumulated up to this view.
+        ground_truth: (n, 4, 4) ``T_world_object`` if the camera has told, for scoring.
         goal: ``T_world_camera`` (4, 4) that the policy asked for next; None for the last view.
         latency_ms: node name to the milliseconds it worked on this view.
     """
@@ -98,7 +101,10 @@ class EpisodeStep:
     index: int
     stamp: int
     T_world_camera: np.ndarray
+    distance: float
+    hypotheses: int
     objects: SceneObjects
+    ground_truth: np.ndarray | None
     goal: np.ndarray | None
     latency_ms: dict[str, float]
 
@@ -258,7 +264,7 @@ class EpisodeMonitor(Node):
         self._poses: dict[int, np.ndarray] = {}
         self._objects: dict[int, SceneObjects] = {}
         self._goals: dict[int, np.ndarray] = {}
-        self._hypotheses: set[int] = set()
+        self._hypotheses: dict[int, int] = {}
         self._latencies: dict[int, dict[str, float]] = {}
         self._ground_truth: np.ndarray | None = None
         self._info: dict[str, str] = {}
@@ -293,14 +299,13 @@ class EpisodeMonitor(Node):
     def result(self, settings: EpisodeSettings, events: list[str]) -> EpisodeResult:
         """What has been heard of the episode, which must have ended."""
         steps = [self._step(index, stamp) for index, stamp in enumerate(sorted(self._poses.keys() & self._objects))]
-        positions = np.array([step.T_world_camera[:3, 3] for step in steps])
         return EpisodeResult(
             settings=settings,
             info=self._info,
             steps=steps,
             ground_truth=self._ground_truth,
             reason=self._reason,
-            distance=ViewSphere(radius=float(np.linalg.norm(positions[0]))).path_length(positions),
+            distance=steps[-1].distance,
             seconds=self._ended - self._began,
             events=events,
         )
@@ -327,10 +332,17 @@ class EpisodeMonitor(Node):
             index,
             stamp,
             self._poses[stamp],
+            self._distance(stamp),
+            self._hypotheses.get(stamp, 0),
             self._objects[stamp],
+            self._ground_truth,
             self._goals.get(stamp),
             self._latencies.get(stamp, {}),
         )
+
+    def _distance(self, stamp: int) -> float:
+        positions = np.array([T[:3, 3] for at, T in sorted(self._poses.items()) if at <= stamp])
+        return ViewSphere(radius=float(np.linalg.norm(positions[0]))).path_length(positions)
 
     def _on_pose(self, message: PoseStamped) -> None:
         if not self._poses:
@@ -338,7 +350,7 @@ class EpisodeMonitor(Node):
         self._poses[stamp_to_ns(message.header.stamp)] = pose_stamped_to_transform(message, message.header.frame_id)
 
     def _on_hypotheses(self, message: PointCloud2) -> None:
-        self._hypotheses.add(stamp_to_ns(message.header.stamp))
+        self._hypotheses[stamp_to_ns(message.header.stamp)] = message.width * message.height
 
     def _on_objects(self, message: PointCloud2) -> None:
         self._objects[stamp_to_ns(message.header.stamp)] = objects_from_cloud(message, message.header.frame_id)
