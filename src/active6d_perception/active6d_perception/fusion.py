@@ -1,17 +1,17 @@
 """Multi-view fusion: all hypotheses so far, clustered in the world; the best verified of each cluster is an object.
 
-The functions :func:`cluster`, :func:`select` and :func:`project_boxes` are pure and know nothing of messages or history, so a
-training environment calls the same ones on precomputed tables. :class:`SceneFusion` keeps the history for them.
+The functions :func:`cluster`, :func:`select` and :func:`project_features` are pure and know nothing of messages or
+history, so a training environment calls the same ones on precomputed tables. :class:`SceneFusion` keeps the history.
 Paper, "Multi-view hypotheses fusion" and "Objects feature representation".
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.cluster.hierarchy import linkage
 from scipy.spatial.distance import squareform
 
-from active6d_core.camera import PinholeCamera, project
+from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert
@@ -60,9 +60,18 @@ def cluster(distance: np.ndarray, cut: float) -> np.ndarray:
     Returns:
         (k,) cluster of each item, from 0.
     """
-    if len(distance) < 2:
-        return np.zeros(len(distance), int)
-    return fcluster(linkage(squareform(distance, checks=False), "average"), cut, "distance") - 1
+    count = len(distance)
+    if count < 2:
+        return np.zeros(count, int)
+    tree = linkage(squareform(distance, checks=False), "average")
+    merges = np.searchsorted(tree[:, 2], cut, side="right")
+    # Each merge makes a node that its two parts point to; following the pointers to their ends gives the clusters.
+    # scipy's fcluster does the same and takes longer over its argument checks than linkage over the tree.
+    node = np.arange(count + merges)
+    node[tree[:merges, :2].astype(np.intp)] = np.arange(count, count + merges)[:, None]
+    while not np.array_equal(node, further := node[node]):
+        node = further
+    return np.unique(node[:count], return_inverse=True)[1]
 
 
 def select(labels: np.ndarray, positions: np.ndarray, exclusion: float) -> np.ndarray:
@@ -82,6 +91,31 @@ def select(labels: np.ndarray, positions: np.ndarray, exclusion: float) -> np.nd
     for index in range(1, len(best)):
         kept[index] = apart[index, :index][kept[:index]].all()
     return best[kept]
+
+
+def summarise(
+    labels: np.ndarray, chosen: np.ndarray, stamps: np.ndarray, distance: np.ndarray, stamp: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the clusters of the chosen hypotheses consist of.
+
+    Args:
+        labels: (k,) clusters of hypotheses in order of preference.
+        chosen: (n,) one hypothesis of each cluster in question.
+        stamps: (k,) views that the hypotheses are from.
+        distance: (k, k) metres.
+        stamp: the current view.
+
+    Returns:
+        (n,) number of views with a hypothesis in the cluster, (n,) largest distance within it, and (n,) its best
+        hypothesis from the current view, -1 without one.
+    """
+    same = labels[:, None] == labels
+    members = same[chosen]
+    views = np.unique(stamps, return_inverse=True)[1]
+    support = ((members @ np.eye(views.max(initial=0) + 1)[views]) > 0).sum(axis=1)
+    spread = (members * np.where(same, distance, 0.0).max(axis=1)).max(axis=1)
+    current = members & (stamps == stamp)
+    return support, spread, np.where(current.any(axis=1), current.argmax(axis=1), -1)
 
 
 def preference(verification: np.ndarray, T_world_object: np.ndarray) -> np.ndarray:
@@ -104,10 +138,12 @@ def project_features(
         (n, 4) boxes, normalised and clipped to the image, and (n,) mean depths of the visible surface, metres.
     """
     R, t = T_camera_object[:, :3, :3], T_camera_object[:, :3, 3]
-    outline = views.outline @ np.swapaxes(R, 1, 2) + t[:, None]
-    outline[..., 2] = np.maximum(outline[..., 2], 1e-3)
-    uv = (project(outline, camera) + 0.5) / (camera.width, camera.height)
-    box = np.concatenate([uv.min(axis=1), uv.max(axis=1)], axis=1).clip(0.0, 1.0)
+    # Coordinates before points, so that each is one contiguous row: several times faster than the other way round.
+    x, y, z = np.moveaxis((R.reshape(-1, 3) @ views.outline.T).reshape(len(R), 3, -1) + t[..., None], 1, 0)
+    z = np.maximum(z, 1e-3)
+    u = (camera.fx * (x / z) + (camera.cx + 0.5)) / camera.width
+    v = (camera.fy * (y / z) + (camera.cy + 0.5)) / camera.height
+    box = np.stack([u.min(axis=1), v.min(axis=1), u.max(axis=1), v.max(axis=1)], axis=1).clip(0.0, 1.0)
     centroid = views.centroids[views.nearest_direction(T_camera_object)]
     return box, np.einsum("nj,nj->n", R[:, 2], centroid) + t[:, 2]
 
@@ -130,7 +166,7 @@ class SceneFusion:
         self._stamps: set[int] = set()
         self._stamp = np.zeros(0, np.int64)
         self._T_world_object = np.zeros((0, 4, 4))
-        # verification, score, box (4), depth
+        # The columns are verification and score, the four of the box, and depth.
         self._table = np.zeros((0, 7))
         self._distances = np.zeros((0, 0))
 
@@ -138,7 +174,8 @@ class SceneFusion:
         """Forget the views older than ``stamp`` in nanoseconds."""
         kept = self._stamp >= stamp
         self._stamps = {known for known in self._stamps if known >= stamp}
-        self._stamp, self._T_world_object, self._table = self._stamp[kept], self._T_world_object[kept], self._table[kept]
+        self._stamp, self._table = self._stamp[kept], self._table[kept]
+        self._T_world_object = self._T_world_object[kept]
         self._distances = self._distances[np.ix_(kept, kept)]
 
     def add_view(
@@ -187,12 +224,6 @@ class SceneFusion:
         labels = cluster(distance, self.parameters.cut * self._diameter)
         chosen = select(labels, T[:, :3, 3], self.parameters.exclusion * self._diameter)
         box, depth = project_features(self._views, invert(T_world_camera) @ T[chosen], camera)
-        support, spread = np.zeros(len(chosen), int), np.zeros(len(chosen))
-        for row, survivor in enumerate(chosen):
-            members = np.flatnonzero(labels == labels[survivor])
-            support[row] = len(np.unique(stamps[members]))
-            spread[row] = distance[np.ix_(members, members)].max()
-            current = members[stamps[members] == stamp]
-            if len(current):
-                box[row], depth[row] = table[current[0], 2:6], table[current[0], 6]
+        support, spread, seen = summarise(labels, chosen, stamps, distance, stamp)
+        box[seen >= 0], depth[seen >= 0] = table[seen[seen >= 0], 2:6], table[seen[seen >= 0], 6]
         return SceneObjects(T[chosen], table[chosen, 0], table[chosen, 1], box, depth, support, spread)
