@@ -17,7 +17,7 @@ MAY_IMPORT = {
     "bringup": {"core", "sim", "perception", "agent"},
 }
 #: Layers two and three, which are made of messages and nodes; bringup's own ROS modules beside its command line.
-ROS_MODULES = {"conversions", "node"}
+ROS_MODULES = {"conversions", "node", "optional_outputs"}
 IMPORT_WITHOUT_ROS = """
 import importlib, sys
 

@@ -1,5 +1,5 @@
 """Geometry, data contracts and metrics shared by every active6d package.
 
-Only :mod:`active6d_core.conversions` and :mod:`active6d_core.node` import ROS; everything else needs numpy, scipy and
+Only :mod:`.conversions`, :mod:`.node` and :mod:`.optional_outputs` import ROS; everything else needs numpy, scipy and
 trimesh alone.
 """
