@@ -109,7 +109,7 @@ def _ros() -> Iterator[Check]:
         from rclpy.utilities import get_rmw_implementation_identifier
 
         yield Check("ROS 2", "middleware", True, True, get_rmw_implementation_identifier())
-    except Exception as error:  # rclpy's native part reports a missing middleware as a plain RuntimeError or ImportError
+    except Exception as error:  # a missing middleware is a RuntimeError or an ImportError
         yield Check("ROS 2", "middleware", False, True, str(error).splitlines()[0], pip_ros)
     distribution = os.environ.get("ROS_DISTRO")
     yield Check(
@@ -120,8 +120,16 @@ def _ros() -> Iterator[Check]:
         f"{distribution or 'jazzy'} ({'apt' if distribution else 'PyPI wheels'})",
         "" if distribution in (None, "jazzy") else "active6d is built for jazzy: source /opt/ros/jazzy/setup.bash",
     )
-    for module in ("sensor_msgs", "geometry_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "lifecycle_msgs"):
-        yield _import_check("ROS 2", f"{module}.{'srv' if module == 'std_srvs' else 'msg'}", module, needed=True, mend=pip_ros)
+    for package in (
+        "sensor_msgs",
+        "geometry_msgs",
+        "std_srvs",
+        "visualization_msgs",
+        "diagnostic_msgs",
+        "lifecycle_msgs",
+    ):
+        module = f"{package}.{'srv' if package == 'std_srvs' else 'msg'}"
+        yield _import_check("ROS 2", module, package, needed=True, mend=pip_ros)
     for module, purpose in (
         ("vision_msgs", "Detection3DArray output"),
         ("tf2_ros", "/tf output"),
@@ -138,7 +146,8 @@ def _ros() -> Iterator[Check]:
 def _project() -> Iterator[Check]:
     for package in ("active6d_core", "active6d_sim", "active6d_perception", "active6d_agent", "active6d_bringup"):
         yield _import_check("active6d", package, package, needed=True, mend="pip install -e src/" + package)
-    yield _attempt("active6d", "object models", _load_objects, mend="see active6d object list; ACTIVE6D_OBJECT_PATH adds folders")
+    mend = "mend the description it names, or ACTIVE6D_OBJECT_PATH, which adds folders"
+    yield _attempt("active6d", "object models", _load_objects, mend)
     yield _weights()
 
 
@@ -151,11 +160,10 @@ def _weights() -> Check:
 
 
 def _self_tests() -> Iterator[Check]:
-    yield _attempt("Self test", "two nodes exchange a message", _exchange_message, mend=(
-        "allow UDP on the loopback interface, or try ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
-    ))
-    yield _attempt("Self test", "ray casting a view", _cast_rays, mend="reinstall open3d, check libusb-1.0-0 and libgl1")
-    yield _attempt("Self test", "writing and reading a bag", _write_bag, mend=PIP)
+    network = "allow UDP on the loopback interface, or try ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
+    yield _attempt("Self test", "two nodes exchange a message", _exchange_message, network)
+    yield _attempt("Self test", "ray casting a view", _cast_rays, "reinstall open3d, check libusb-1.0-0 and libgl1")
+    yield _attempt("Self test", "writing and reading a bag", _write_bag, PIP)
 
 
 def _attempt(group: str, name: str, action: Callable[[], str], mend: str) -> Check:
@@ -187,7 +195,7 @@ def _exchange_message() -> str:
     rclpy.init(context=context)
     executor = SingleThreadedExecutor(context=context)
     received: list[str] = []
-    nodes = [rclpy.create_node(f"doctor_{role}", context=context, start_parameter_services=False) for role in ("a", "b")]
+    nodes = [rclpy.create_node(f"doctor_{name}", context=context, start_parameter_services=False) for name in "ab"]
     try:
         nodes[0].create_subscription(String, "~/echo", lambda message: received.append(message.data), 1)
         publisher = nodes[1].create_publisher(String, "/doctor_a/echo", 1)

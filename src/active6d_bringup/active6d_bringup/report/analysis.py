@@ -125,7 +125,9 @@ class EpisodeAnalysis:
                 }
                 for step in self.steps
             ],
-            "node_times": {time.node: {"median_ms": time.median_ms, "longest_ms": time.longest_ms} for time in self.node_times},
+            "node_times": {
+                time.node: {"median_ms": time.median_ms, "longest_ms": time.longest_ms} for time in self.node_times
+            },
         }
 
 
@@ -144,7 +146,8 @@ def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAna
         raise ValueError(f"{record.folder}: the bag does not say which object it shows; name it with --object")
     # The bag's word must not choose a file, so only listed names are loaded.
     if name not in list_objects():
-        raise ValueError(f"{record.folder}: object '{name}' is not among {', '.join(list_objects())}; name one with --object")
+        known = ", ".join(list_objects())
+        raise ValueError(f"{record.folder}: object '{name}' is not among {known}; name one with --object")
     model = load_object(name)
     truth = record.ground_truth
     positions = record.positions

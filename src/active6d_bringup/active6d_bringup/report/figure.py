@@ -1,6 +1,7 @@
 """An episode as one picture: its views with outlines coloured by score, its path, and how the score rose."""
 
 import io
+from itertools import pairwise
 
 import matplotlib
 import numpy as np
@@ -8,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
-from matplotlib.patheffects import withStroke
 from matplotlib.path import Path as Polygon
+from matplotlib.patheffects import withStroke
 
 from active6d_bringup.report.analysis import EpisodeAnalysis, StepAnalysis
 from active6d_bringup.report.drawing import StepOutlines, outline_step, score_color
@@ -22,7 +23,7 @@ _FONT = {"font.family": "DejaVu Sans", "font.size": 9, "axes.edgecolor": "#c9d0d
 
 
 def render_png(analysis: EpisodeAnalysis) -> bytes:
-    """PNG of up to six views (the first, the last, and evenly between), the camera's path and the course of the errors."""
+    """PNG of up to six views (first, last, and evenly between), the camera's path and the course of the errors."""
     chosen = np.unique(np.linspace(0, len(analysis.steps) - 1, _MOST_VIEWS).round().astype(int))
     drawer = SilhouetteDrawer(analysis.model)
     with matplotlib.rc_context(_FONT):
@@ -66,7 +67,8 @@ def _draw_view(axes: Axes, step: StepAnalysis, outlines: StepOutlines) -> None:
         axes.add_patch(PathPatch(shape, facecolor="none", edgecolor=color, linewidth=1.5, path_effects=[edge]))
     axes.set(xlim=(-0.5, view.camera.width - 0.5), ylim=(view.camera.height - 0.5, -0.5), xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
-    found = f"{step.truth.detected.sum()} of {len(step.truth.detected)} found" if step.truth else f"{len(step.rows)} objects"
+    truth = step.truth
+    found = f"{truth.detected.sum()} of {len(truth.detected)} found" if truth else f"{len(step.rows)} objects"
     axes.set_title(f"view {step.number}", loc="left", size=9, weight="bold", pad=4)
     axes.set_title(found, loc="right", size=9, color=_SOFT, pad=4)
 
@@ -85,15 +87,16 @@ def _draw_path(axes: Axes, analysis: EpisodeAnalysis) -> None:
         axes.plot(*(line @ projection).T, color=_SOFT, lw=0.6, alpha=0.3)
     axes.scatter(*(sphere.positions @ projection).T, s=3, color=_SOFT, alpha=0.45, linewidths=0)
     last = analysis.steps[-1]
-    nearest_last = np.argsort(last.objects.T_world_object[:, :3, 3] @ toward)
+    centers = last.objects.T_world_object[:, :3, 3]
+    nearest_last = np.argsort(centers @ toward)
     colors = [score_color(last.rows[i].verification) for i in nearest_last]
-    axes.scatter(*(last.objects.T_world_object[nearest_last, :3, 3] @ projection).T, s=80, c=colors, linewidths=0, alpha=0.9)
-    for start, end in zip(cameras[:-1], cameras[1:], strict=True):
+    axes.scatter(*(centers[nearest_last] @ projection).T, s=80, c=colors, linewidths=0, alpha=0.9)
+    for start, end in pairwise(cameras):
         axes.plot(*(_arc(start, end, sphere.radius) @ projection).T, color=_ACCENT, lw=2.2, solid_capstyle="round")
     for number, position in enumerate(cameras @ projection):
-        is_last = number == len(cameras) - 1
-        circle = {"boxstyle": "circle,pad=0.28", "facecolor": _ACCENT if is_last else "white", "edgecolor": _ACCENT}
-        axes.text(*position, str(number), size=8, weight="bold", color="white" if is_last else _ACCENT, ha="center", va="center", bbox=circle)
+        fill, ink = (_ACCENT, "white") if number == len(cameras) - 1 else ("white", _ACCENT)
+        circle = {"boxstyle": "circle,pad=0.28", "facecolor": fill, "edgecolor": _ACCENT}
+        axes.text(*position, str(number), size=8, weight="bold", color=ink, ha="center", va="center", bbox=circle)
     axes.set_aspect("equal")
     axes.margins(0.06)
     axes.set_axis_off()

@@ -1,7 +1,7 @@
 """An episode as one HTML file that needs nothing else: pictures, drawings and data are inside it."""
 
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -88,7 +88,7 @@ def _facts(analysis: EpisodeAnalysis) -> list[tuple[str, str]]:
     facts = [(key.replace("_", " "), value) for key, value in analysis.record.info.items() if key not in shown]
     started = analysis.steps[0].record.stamp
     if started > 1e18:  # a real camera's clock; simulated time begins at one second
-        facts.append(("started", datetime.fromtimestamp(started / 1e9, timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")))
+        facts.append(("started", datetime.fromtimestamp(started / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")))
     return [*facts, ("bag", str(analysis.record.folder))]
 
 

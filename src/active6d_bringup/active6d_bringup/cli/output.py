@@ -1,0 +1,78 @@
+"""What the subcommands share: the terminal, progress with time left, options, JSON with the versions that made it."""
+
+import json
+import os
+import platform
+import tempfile
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+console = Console()
+#: Progress and notes, so that standard output holds results only.
+messages = Console(stderr=True)
+
+JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured to this file.")]
+Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
+ObjectName = Annotated[str, typer.Option("--object", help="Object to work on, see `active6d object list`.")]
+
+_VERSIONS = ("numpy", "scipy", "open3d", "pybullet", "torch", "rclpy")
+
+
+def progress_bar() -> Progress:
+    """A progress bar on standard error with a description, counts, elapsed time and time left."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(compact=True),
+        console=messages,
+    )
+
+
+def write_json(path: Path | None, result: dict[str, Any]) -> None:
+    """Write a result with the versions of what made it; nothing happens without a path.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    if path is None:
+        return
+    document = {**result, "versions": {"python": platform.python_version(), **_installed_versions()}}
+    write_file(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    messages.print(f"wrote {path}", highlight=False)
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file in one step, folders included: a reader never sees half of it.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = content.encode() if isinstance(content, str) else content
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def _installed_versions() -> dict[str, str]:
+    versions = {}
+    for name in _VERSIONS:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions

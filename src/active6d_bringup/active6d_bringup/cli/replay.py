@@ -1,0 +1,118 @@
+"""``active6d replay``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from active6d_bringup.cli.episode import parse_overrides
+from active6d_bringup.cli.output import JsonFile, console, progress_bar, write_json
+
+if TYPE_CHECKING:
+    from active6d_bringup.replay import ReplayResult, ReplaySettings
+
+
+def replay(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a recorded bag.")],
+    rate: Annotated[float, typer.Option(min=1e-3, help="Speed against the recording's.")] = 1.0,
+    as_fast: Annotated[
+        bool, typer.Option("--as-fast", help="Send a view as soon as the objects of the last one are there.")
+    ] = False,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Exit with 1 unless hypotheses and objects equal the recorded ones.")
+    ] = False,
+    object_name: Annotated[
+        str | None, typer.Option("--object", help="The object, where the bag does not name it.")
+    ] = None,
+    estimator: Annotated[str | None, typer.Option(help="Another estimator than the recorded one.")] = None,
+    record: Annotated[Path | None, typer.Option(metavar="DIR", help="Record the replay into this new folder.")] = None,
+    processes: Annotated[bool, typer.Option("--processes", help="Run every node in a process of its own.")] = False,
+    params_file: Annotated[Path | None, typer.Option(metavar="FILE", help="ROS parameters of all nodes.")] = None,
+    override: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NODE.NAME=VALUE", help="One parameter of one node; repeatable."),
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Send a bag's camera through live perception.
+
+    Example: [bold]active6d replay bags/mug --as-fast --compare[/bold]
+    """
+    if as_fast and rate != 1.0:
+        raise ValueError("--rate and --as-fast exclude each other")
+    from active6d_bringup.replay import ReplaySettings
+
+    settings = ReplaySettings(
+        bag=folder,
+        rate=0.0 if as_fast else rate,
+        object=object_name,
+        estimator=estimator,
+        processes=processes,
+        params_file=params_file,
+        overrides=parse_overrides(override or []),
+        record=record,
+    )
+    result = _run(settings)
+    console.print(f"{result.views} views in {result.seconds:.1f} s", highlight=False)
+    if compare:
+        _print_comparison(result)
+    write_json(json_file, _summary(result))
+    if compare and not result.equal:
+        raise typer.Exit(1)
+
+
+def _run(settings: "ReplaySettings") -> "ReplayResult":
+    from active6d_bringup.episode import EpisodeError, EpisodeInterrupted
+    from active6d_bringup.processes import ProcessError
+    from active6d_bringup.replay import replay as run_replay
+
+    with progress_bar() as progress:
+        task = progress.add_task("starting the nodes", total=None)
+        try:
+            return run_replay(
+                settings,
+                lambda done, total: progress.update(task, completed=done, total=total, description="replaying"),
+            )
+        except (EpisodeError, ProcessError) as error:
+            failure, code = str(error), 1
+        except EpisodeInterrupted:
+            failure, code = "interrupted", 130
+    typer.echo(f"active6d: {failure}", err=True)
+    raise typer.Exit(code)
+
+
+def _print_comparison(result: "ReplayResult") -> None:
+    if result.equal:
+        console.print("[green]equal[/green]: hypotheses, masks and objects of every view are the recorded ones")
+        return
+    views = {comparison.stamp for comparison in result.comparisons if not comparison.equal}
+    console.print(f"[red]different[/red] in {len(views)} of {result.views} views")
+    missing = sorted({comparison.topic for comparison in result.comparisons if comparison.recorded is None})
+    if missing:
+        console.print(f"the bag lacks messages of {', '.join(missing)}", highlight=False)
+    for name, difference in result.largest_differences().items():
+        text = "other sizes" if difference != difference else f"{difference:.3g} at most"
+        console.print(f"  {name}: {text}", highlight=False, markup=False)
+
+
+def _summary(result: "ReplayResult") -> dict:
+    return {
+        "views": result.views,
+        "seconds": result.seconds,
+        "equal": result.equal,
+        "messages": [
+            {
+                "stamp": comparison.stamp,
+                "topic": comparison.topic,
+                "recorded": comparison.recorded,
+                "live": comparison.live,
+                "equal": comparison.equal,
+            }
+            for comparison in result.comparisons
+        ],
+        # JSON has no NaN, which stands for sizes that differ.
+        "largest_differences": {
+            name: None if difference != difference else difference
+            for name, difference in result.largest_differences().items()
+        },
+    }
