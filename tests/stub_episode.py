@@ -14,7 +14,7 @@ from active6d_core.view_sphere import ViewSphere
 
 CAMERA = PinholeCamera.from_field_of_view(32, 24, 60.0)
 FIRST = 1_000_000_000
-LATCHED = ("camera/", "ground_truth/", "episode/")
+LATCHED = ("camera/", "ground_truth/", "episode/", "hypotheses", "objects")
 
 
 @dataclass(frozen=True, eq=False)

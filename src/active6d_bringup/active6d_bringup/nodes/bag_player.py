@@ -19,8 +19,8 @@ _REPLAYED = (*CAMERA_TOPICS, *(topic for topic in CONTRACT if topic.name in ("ep
 class BagPlayerNode(GraphNode):
     """Publishes what the camera said, view by view and byte by byte, then ``episode/end``.
 
-    With ``rate`` 0 the next view goes out when ``objects`` of the last one have arrived; otherwise when as much time has
-    passed as in the recording, divided by ``rate``.
+    With ``rate`` 0 the next view goes out when ``objects`` of the last one have arrived; otherwise when as much time
+    has passed as in the recording, divided by ``rate``.
     """
 
     def __init__(self, **arguments) -> None:
