@@ -35,7 +35,7 @@ class BagPlayerNode(GraphNode):
             message_type = getattr(import_module(f"{package}.msg"), name)
             self._publishers[topic.name] = self.output(message_type, topic.name, latched=True)
         self._end = self.output(DiagnosticArray, END, latched=True)
-        self.input(PointCloud2, "objects", self._on_objects)
+        self.input(PointCloud2, "objects", self._on_objects, latched=True)
         self._timer: Timer | None = None
 
     def setup(self) -> None:
