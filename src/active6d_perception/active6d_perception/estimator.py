@@ -11,7 +11,10 @@ from active6d_core.object_model import ObjectModel
 
 #: Modules that register the estimators of this package. Imported on first use, so that a depth-only estimator
 #: does not pay for the libraries of a learned one.
-_BUILT_IN = {"geometric": "active6d_perception.geometric.estimator"}
+_BUILT_IN = {
+    "dense": "active6d_perception.dense.estimator",
+    "geometric": "active6d_perception.geometric.estimator",
+}
 _factories: dict[str, Callable[..., "Estimator"]] = {}
 
 
@@ -19,7 +22,7 @@ class Estimator(Protocol):
     """Says which instances of one object a view shows, and where."""
 
     def estimate(self, view: View) -> Hypotheses:
-        """Pose hypotheses of ``view`` in its optical frame, with boxes and label masks (paper, "6D object pose estimation").
+        """Pose hypotheses of ``view`` in its optical frame, with boxes and masks (paper, "6D object pose estimation").
 
         An estimator is deterministic: the same view gives the same hypotheses.
         """

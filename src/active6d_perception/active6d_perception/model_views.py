@@ -46,6 +46,8 @@ class ModelViews:
         self.directions = np.asarray(trimesh.creation.icosphere(_SUBDIVISIONS).vertices)
         eyes = self.directions * (_EYE_DISTANCE * model.diameter)
         self.visible = visible_from(model.mesh, eyes, self.points, self.normals)
+        self._trees: dict[int, tuple[np.ndarray, cKDTree]] = {}
+        self._subsets: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         hull = np.asarray(model.mesh.convex_hull.vertices)
         self.outline = hull[np.unique((self.directions[:162] @ hull.T).argmax(axis=1))]
 
@@ -60,15 +62,20 @@ class ModelViews:
         weight = self.visible * np.maximum(self.directions @ self.normals.T, 0.0)
         return weight @ self.points / weight.sum(axis=1, keepdims=True)
 
-    @lru_cache(maxsize=1024)
     def visible_tree(self, direction: int) -> tuple[np.ndarray, cKDTree]:
-        """(v,) indices of the samples visible from a direction, and a search tree over them."""
-        index = np.flatnonzero(self.visible[direction])
-        return index, cKDTree(self.points[index])
+        """(v,) indices of the samples visible from a direction, and a search tree over them; kept once made."""
+        if direction not in self._trees:
+            index = np.flatnonzero(self.visible[direction])
+            self._trees[direction] = index, cKDTree(self.points[index])
+        return self._trees[direction]
 
-    @lru_cache(maxsize=8)
     def visible_subset(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """At most ``count`` visible samples of each direction, evenly taken: (m, count) indices, (m, count) bool used."""
+        """At most ``count`` visible samples a direction, evenly taken: (m, count) indices, (m, count) bool used."""
+        if count not in self._subsets:
+            self._subsets[count] = self._take_evenly(count)
+        return self._subsets[count]
+
+    def _take_evenly(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         index = np.zeros((len(self.directions), count), np.intp)
         used = np.zeros(index.shape, bool)
         for row, visible in enumerate(self.visible):

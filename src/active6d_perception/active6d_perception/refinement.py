@@ -20,7 +20,7 @@ class Evidence:
 
     Attributes:
         fitting: (k,) measured where the pose puts it, with a normal alike.
-        violated: (k,) the camera looked through it: something behind it was measured, or nothing of the object is in the image.
+        violated: (k,) the camera looked through it: something behind it was measured.
         occluded: (k,) behind something else.
     """
 
@@ -123,7 +123,7 @@ def refine(
 def _point_to_plane_step(
     T: np.ndarray, points: np.ndarray, normals: np.ndarray, targets: np.ndarray, matched: np.ndarray
 ) -> np.ndarray:
-    """One Gauss-Newton step for (k, 4, 4) poses; rotations are about each pose's own origin, to keep the system well scaled."""
+    """One Gauss-Newton step for (k, 4, 4) poses, each turned about its own origin to keep the system well scaled."""
     arms = points - T[:, None, :3, 3]
     jacobian = np.concatenate([np.cross(arms, normals), normals], axis=-1) * matched[..., None]
     residual = np.einsum("ksi,ksi->ks", targets - points, normals) * matched

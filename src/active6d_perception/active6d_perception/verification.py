@@ -144,7 +144,8 @@ def points_and_normals(
         after = _backproject(depth, camera, np.minimum(u + du, width - 1), np.minimum(v + dv, height - 1)) - points
         before = points - _backproject(depth, camera, np.maximum(u - du, 0), np.maximum(v - dv, 0))
         jump_after, jump_before = np.abs(after[:, 2]), np.abs(before[:, 2])
-        one_side = np.where((np.nan_to_num(jump_after, nan=np.inf) <= np.nan_to_num(jump_before, nan=np.inf))[:, None], after, before)
+        flatter = np.nan_to_num(jump_after, nan=np.inf) <= np.nan_to_num(jump_before, nan=np.inf)
+        one_side = np.where(flatter[:, None], after, before)
         # A smooth surface changes its slope little within a few pixels; 5 mm between the two sides is an edge.
         smooth = np.abs(jump_after - jump_before) < 0.005
         tangents.append(np.where(smooth[:, None], after + before, one_side))

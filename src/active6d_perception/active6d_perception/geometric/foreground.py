@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from active6d_core.camera import PinholeCamera, backproject, normals_from_points
@@ -35,9 +34,7 @@ def measure_surface(depth: np.ndarray, camera: PinholeCamera, object_diameter: f
         camera: intrinsics.
         object_diameter: metres; a plane is background when it is larger than any object's face could be.
     """
-    filled = np.nan_to_num(depth.astype(np.float32), nan=0.0, posinf=0.0)
-    smooth = cv2.bilateralFilter(filled, d=5, sigmaColor=0.006, sigmaSpace=2.0)
-    smooth[filled <= 0] = np.nan
+    smooth = smooth_within_surfaces(smooth_within_surfaces(depth.astype(np.float32), axis=0), axis=1)
     points = backproject(smooth, camera)
     normals = normals_from_points(points, reach=3)
     foreground = np.isfinite(smooth)
@@ -47,7 +44,33 @@ def measure_surface(depth: np.ndarray, camera: PinholeCamera, object_diameter: f
     return Surface(camera, smooth, points, normals, foreground)
 
 
-def find_large_planes(points: np.ndarray, normals: np.ndarray, object_diameter: float) -> list[tuple[np.ndarray, float]]:
+def smooth_within_surfaces(depth: np.ndarray, axis: int, reach: int = 2, gate: float = 0.008) -> np.ndarray:
+    """Mean over the pixels up to ``reach`` away along one axis whose depth differs by less than ``gate`` metres.
+
+    Args:
+        depth: (H, W) float32 metres, NaN invalid; invalid pixels stay so.
+        axis: 0 down the columns, 1 along the rows.
+        reach: pixels.
+        gate: metres.
+    """
+    total, count = depth.copy(), np.ones(depth.shape, np.float32)
+    for shift in range(1, reach + 1):
+        ahead = [slice(None), slice(None)]
+        behind = ahead.copy()
+        ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
+        difference = depth[tuple(ahead)] - depth[tuple(behind)]
+        same = np.abs(difference) < gate  # false where either is NaN
+        difference[~same] = 0.0
+        total[tuple(behind)] += same * depth[tuple(behind)] + difference
+        total[tuple(ahead)] += same * depth[tuple(ahead)] - difference
+        count[tuple(behind)] += same
+        count[tuple(ahead)] += same
+    return total / count
+
+
+def find_large_planes(
+    points: np.ndarray, normals: np.ndarray, object_diameter: float
+) -> list[tuple[np.ndarray, float]]:
     """Planes that hold more surface than an object's largest possible face, biggest first (sequential RANSAC, seeded).
 
     One sample is a point with its normal, so a plane needs a single good draw.

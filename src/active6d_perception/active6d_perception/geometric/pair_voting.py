@@ -83,8 +83,10 @@ class PairVoting:
         poses = np.repeat(invert(frames), peaks, axis=0) @ turned @ self._reference_frames[reference]
         return poses, np.take_along_axis(votes, best, axis=1).ravel()
 
-    def _features(self, p1: np.ndarray, n1: np.ndarray, p2: np.ndarray, n2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Quantised feature of (n,) pairs that are neither too close nor too far, and which those are: (m,), (n,) bool."""
+    def _features(
+        self, p1: np.ndarray, n1: np.ndarray, p2: np.ndarray, n2: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Quantised features (m,) of those of n pairs that are neither too close nor too far, and which: (n,) bool."""
         d = p2 - p1
         distance = np.linalg.norm(d, axis=1)
         kept = (distance > 0.05 * self._diameter) & (distance < self._diameter)
@@ -92,11 +94,15 @@ class PairVoting:
         feature = (distance * (_DISTANCE_BINS / self._diameter)).astype(np.intp)
         for a, b in ((n1, d), (n2, d), (n1, n2)):
             angle = np.arccos(np.clip(np.einsum("ni,ni->n", a, b), -1, 1))
-            feature = feature * _ANGLE_BINS + np.minimum((angle * (_ANGLE_BINS / np.pi)).astype(np.intp), _ANGLE_BINS - 1)
+            feature = feature * _ANGLE_BINS + np.minimum(
+                (angle * (_ANGLE_BINS / np.pi)).astype(np.intp), _ANGLE_BINS - 1
+            )
         return feature, kept
 
 
-def _keep_wedge(points: np.ndarray, axis: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _keep_wedge(
+    points: np.ndarray, axis: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     side = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     azimuth = np.arctan2(points @ np.cross(axis, side), points @ side)

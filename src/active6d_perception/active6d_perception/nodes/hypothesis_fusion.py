@@ -1,0 +1,140 @@
+"""Verifies every view's hypotheses against its depth image and fuses them with those of earlier views."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray, PoseStamped
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from active6d_core.conversions import (
+    MessageError,
+    hypotheses_from_cloud,
+    image_to_depth,
+    image_to_segmentation,
+    info_to_camera,
+    objects_to_cloud,
+    objects_to_markers,
+    pose_stamped_to_transform,
+    poses_to_array,
+    require_frame,
+    stamp_to_ns,
+)
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.node import GraphNode, StampSynchronizer, run_node
+from active6d_core.object_model import ObjectModel, load_object
+from active6d_perception.fusion import FusionParameters, SceneFusion
+from active6d_perception.verification import Verifier
+
+
+class HypothesisFusionNode(GraphNode):
+    """Hypotheses with masks, depth and camera pose in; ``objects``, ``objects/poses`` and ``objects/markers`` out."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("hypothesis_fusion", **options)
+        self._object = self.declare("object", "mug", "name of the object that the hypotheses are of")
+        self._epsilon = self.declare("epsilon", 0.010, "threshold of the verification score, metres", minimum=1e-4)
+        self._samples = self.declare("samples", 128, "most scene points verified per hypothesis", minimum=1)
+        self._parameters = FusionParameters(
+            cut=self.declare(
+                "cut", FusionParameters.cut, "clusters are cut at this fraction of the diameter", minimum=1e-3
+            ),
+            exclusion=self.declare(
+                "exclusion",
+                FusionParameters.exclusion,
+                "two objects are at least this fraction of the diameter apart",
+                minimum=0.0,
+            ),
+            min_verification=self.declare(
+                "min_verification",
+                FusionParameters.min_verification,
+                "hypotheses verified worse are ignored",
+                minimum=-1.0,
+                maximum=1.0,
+            ),
+        )
+        latched = self.declare("latched_camera", True, "camera topics are transient-local, false for plain drivers")
+        self._published: tuple[int, SceneObjects] | None = None
+        self._objects = self.output(PointCloud2, "objects", latched=True)
+        self._poses = self.output(PoseArray, "objects/poses", latched=True)
+        self._markers = self.output(MarkerArray, "objects/markers", latched=True)
+        names = ("hypotheses", "segmentation", "depth", "camera", "pose")
+        self._views = StampSynchronizer(names, self._on_view)
+        self.input(PointCloud2, "hypotheses", self._on_hypotheses, latched=True)
+        self.input(Image, "hypotheses/segmentation", self._on_segmentation, latched=True)
+        self.input(Image, "camera/depth/image_raw", self._on_depth, latched)
+        self.input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
+        self.input(PoseStamped, "camera/pose", self._on_pose, latched)
+        self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
+
+    def setup(self) -> None:
+        """Load the object and precompute its views."""
+        model = load_object(self._object)
+        self._verifier = Verifier(model, self._epsilon, self._samples)
+        self._fusion = SceneFusion(model, self._parameters)
+        self._mesh_uri = export_mesh(model)
+
+    def _on_hypotheses(self, message: PointCloud2) -> None:
+        stamp = stamp_to_ns(message.header.stamp)
+        if self._published is not None and stamp == self._published[0]:
+            self._publish()  # a restarted estimator repeats its last view; whoever awaits the result gets it again
+            return
+        self._views.add("hypotheses", stamp, message)
+
+    def _on_segmentation(self, message: Image) -> None:
+        require_frame(message.header, self.camera_frame)
+        stamp = stamp_to_ns(message.header.stamp)
+        if self._published is None or stamp != self._published[0]:
+            self._views.add("segmentation", stamp, image_to_segmentation(message))
+
+    def _on_depth(self, message: Image) -> None:
+        require_frame(message.header, self.camera_frame)
+        self._views.add("depth", stamp_to_ns(message.header.stamp), image_to_depth(message))
+
+    def _on_camera(self, message: CameraInfo) -> None:
+        require_frame(message.header, self.camera_frame)
+        self._views.add("camera", stamp_to_ns(message.header.stamp), info_to_camera(message))
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        self._views.add("pose", stamp_to_ns(message.header.stamp), pose_stamped_to_transform(message, self.world_frame))
+
+    def _on_episode_start(self, message: DiagnosticArray) -> None:
+        self._fusion.forget_before(stamp_to_ns(message.header.stamp))
+
+    def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
+        camera, depth, segmentation = values["camera"], values["depth"], values["segmentation"]
+        size = (camera.height, camera.width)
+        if depth.shape != size or segmentation.shape != size:
+            raise MessageError(f"camera_info says {size}, depth is {depth.shape}, masks are {segmentation.shape}")
+        hypotheses = hypotheses_from_cloud(values["hypotheses"], segmentation, self.camera_frame)
+        with self.measure(stamp):
+            verification = self._verifier.score(depth, camera, hypotheses)
+            self._fusion.add_view(stamp, values["pose"], hypotheses, verification)
+            self._published = stamp, self._fusion.objects(stamp, values["pose"], camera)
+            self._publish()
+
+    def _publish(self) -> None:
+        stamp, objects = self._published
+        self._objects.publish(objects_to_cloud(objects, stamp, self.world_frame))
+        self._poses.publish(poses_to_array(objects.T_world_object, stamp, self.world_frame))
+        self._markers.publish(objects_to_markers(objects, self._mesh_uri, stamp, self.world_frame))
+
+
+def export_mesh(model: ObjectModel) -> str:
+    """Write the model's mesh, in its own frame and metres, where viewers can read it; the file's URI.
+
+    The path depends on the object only, so that recorded markers are the same every time.
+    """
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "active6d" / "meshes"
+    folder.mkdir(parents=True, exist_ok=True)
+    path, unfinished = folder / f"{model.name}.stl", folder / f"{model.name}.{os.getpid()}.part"
+    model.mesh.export(unfinished, file_type="stl")
+    unfinished.replace(path)
+    return path.as_uri()
+
+
+def main() -> None:
+    """Entry point of ``ros2 run active6d_perception hypothesis_fusion``."""
+    run_node(HypothesisFusionNode)
