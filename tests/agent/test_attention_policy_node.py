@@ -50,7 +50,7 @@ class Episode:
     def view(self, view, stamp=None):
         self.stamp = self.stamp + SECOND if stamp is None else stamp
         self.pose(view, self.stamp)
-        self.graph.publish("objects", objects_to_cloud(self.objects, self.stamp, "world"))
+        self.graph.publish("objects", objects_to_cloud(self.objects, self.stamp, "world"), latched=True)
 
     def goal_views(self):
         return [SPHERE.nearest(pose_stamped_to_transform(goal, "world")[:3, 3]) for goal in self.goals]
@@ -187,7 +187,7 @@ def test_bad_objects_are_refused_and_the_node_lives(episode, damage, complaint):
     cloud = objects_to_cloud(played.objects, SECOND, "world")
     damage(cloud)
     played.pose(3, SECOND)
-    played.graph.publish("objects", cloud)
+    played.graph.publish("objects", cloud, latched=True)
     played.graph.spin_until(lambda: any(complaint in error for error in played.errors()), what=complaint)
     assert not played.goals
     played.view(3, SECOND)
