@@ -39,8 +39,8 @@ HEADER = """\
 def node_type(package: str, executable: str) -> type[GraphNode]:
     """The node class of an executable."""
     module = import_module(f"{package}.nodes.{executable}")
-    classes = [value for value in vars(module).values() if inspect.isclass(value) and value.__module__ == module.__name__]
-    return next(value for value in classes if issubclass(value, GraphNode))
+    classes = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
+    return next(c for c in classes if issubclass(c, GraphNode))
 
 
 def parameters(node: GraphNode) -> Iterator[tuple[Parameter, str, str]]:
@@ -56,6 +56,11 @@ def as_yaml(value: object) -> str:
     return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("...\n").strip()
 
 
+def relative(name: str) -> str:
+    """A name without the root namespace; diagnostics belong to the machine."""
+    return name if name == "/diagnostics" else name.removeprefix("/")
+
+
 def endpoints(node: GraphNode) -> Iterator[tuple[str, str, str, str]]:
     """Direction, name, type and durability of each topic and service, rclpy's own left out."""
     for direction, found in (("subscribes", node.subscriptions), ("publishes", node.publishers)):
@@ -64,12 +69,16 @@ def endpoints(node: GraphNode) -> Iterator[tuple[str, str, str, str]]:
             if module in ("rcl_interfaces", "lifecycle_msgs"):
                 continue
             latched = endpoint.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-            name = endpoint.topic_name if endpoint.topic_name == "/diagnostics" else endpoint.topic_name.removeprefix("/")
-            yield direction, name, f"{module}/{endpoint.msg_type.__name__}", "latched" if latched else ""
+            yield (
+                direction,
+                relative(endpoint.topic_name),
+                f"{module}/{endpoint.msg_type.__name__}",
+                "latched" if latched else "",
+            )
     for service in sorted(node.services, key=lambda service: service.srv_name):
         module = service.srv_type.__module__.split(".")[0]
         if module not in ("rcl_interfaces", "lifecycle_msgs", "type_description_interfaces"):
-            yield "serves", service.srv_name.removeprefix("/"), f"{module}/{service.srv_type.__name__}", ""
+            yield "serves", relative(service.srv_name), f"{module}/{service.srv_type.__name__}", ""
 
 
 def parameter_section(executable: str, node: GraphNode) -> str:

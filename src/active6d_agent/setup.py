@@ -10,13 +10,13 @@ setup(
     maintainer_email="active6d@example.org",
     license="Apache-2.0",
     packages=find_packages(),
-    package_data={package: ["weights/*"]},
+    package_data={package: ["weights/**/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
     ],
     python_requires=">=3.11",
-    install_requires=["active6d_core", "active6d_perception", "numpy"],
+    install_requires=["active6d_core", "active6d_perception", "numpy", "pyyaml"],
     entry_points={
         "console_scripts": [
             "attention_policy = active6d_agent.nodes.attention_policy:main",

@@ -19,7 +19,22 @@ setup(
         *((f"share/{package}/{folder}", glob(f"{folder}/*")) for folder in ("launch", "config", "rviz", "foxglove")),
     ],
     python_requires=">=3.11",
-    install_requires=["active6d_core", "active6d_sim", "active6d_perception", "active6d_agent", "jinja2", "matplotlib", "mcap", "numpy", "pillow", "pyyaml", "rich", "rosbags", "typer"],
+    install_requires=[
+        "active6d_core",
+        "active6d_sim",
+        "active6d_perception",
+        "active6d_agent",
+        "jinja2",
+        "matplotlib",
+        "numpy",
+        "open3d-cpu",
+        "pillow",
+        "pyyaml",
+        "rich",
+        "rosbags",
+        "scipy",
+        "typer",
+    ],
     entry_points={
         "console_scripts": [
             "episode_recorder = active6d_bringup.nodes.episode_recorder:main",

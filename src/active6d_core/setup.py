@@ -5,12 +5,12 @@ package = "active6d_core"
 setup(
     name=package,
     version="0.1.0",
-    description="SE(3), cameras, view hemisphere, object models, hypotheses, metrics and message conversions of active6d",
+    description="SE(3), cameras, view hemisphere, object models, hypotheses and metrics of active6d",
     maintainer="active6d developers",
     maintainer_email="active6d@example.org",
     license="Apache-2.0",
     packages=find_packages(),
-    package_data={package: ["objects/*"]},
+    package_data={package: ["objects/**/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

@@ -1,0 +1,58 @@
+"""The Docker files, without an engine: paths that are copied exist, services start what exists."""
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import yaml
+from catkin_pkg.package import parse_package
+
+ROOT = Path(__file__).parents[2]
+DOCKERFILE = (ROOT / "docker/Dockerfile").read_text().replace("\\\n", " ")
+SERVICES = yaml.safe_load((ROOT / "docker/compose.yaml").read_text())["services"]
+PARAMETERS = yaml.safe_load((ROOT / "src/active6d_bringup/config/active6d.yaml").read_text())
+
+
+def test_copied_paths_exist():
+    copies = re.findall(r"^COPY (?!--from)(.+)$", DOCKERFILE, re.MULTILINE)
+    assert copies
+    for copy in copies:
+        *sources, _ = copy.split()
+        for source in sources:
+            assert (ROOT / source).exists(), source
+
+
+def test_stages_that_are_referred_to_exist():
+    stages = re.findall(r"^FROM (\S+) AS (\S+)$", DOCKERFILE, re.MULTILINE)
+    assert stages[0][0] == "ros:jazzy"
+    names = {name for _, name in stages}
+    assert {base for base, _ in stages[1:]} <= names
+    assert set(re.findall(r"--from=(\S+)", DOCKERFILE)) <= names
+    assert {service["build"]["target"] for service in SERVICES.values()} <= names
+
+
+def test_skipped_keys_are_keys_of_the_packages():
+    keys = {d.name for path in (ROOT / "src").glob("*/package.xml") for d in parse_package(path).exec_depends}
+    skipped = re.findall(r'--skip-keys "([^"]+)"', DOCKERFILE)
+    assert set(" ".join(skipped).split()) <= keys
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_service(name):
+    service = SERVICES[name]
+    assert (ROOT / "docker" / service["build"]["context"]).resolve() == ROOT
+    assert (ROOT / service["build"]["dockerfile"]).is_file()
+    run, package, executable, *rest = service["command"][1:]
+    assert run == "run"
+    entry = f'"{executable} = {package}.nodes.{executable}:main"'
+    assert entry in (ROOT / "src" / package / "setup.py").read_text()
+    given = {argument.split(":=")[0] for flag, argument in pairwise(rest) if flag == "-p"}
+    assert given <= PARAMETERS[f"/**/{executable}"]["ros__parameters"].keys()
+    assert set(service.get("depends_on", [])) <= SERVICES.keys()
+
+
+def test_only_the_simulator_has_pybullet():
+    assert [name for name, service in SERVICES.items() if service["build"]["target"] == "simulator"] == ["camera"]
+    robot = DOCKERFILE.split("AS robot")[1].split("FROM")[0]
+    assert "active6d_sim src" not in robot

@@ -1,0 +1,57 @@
+"""The launch file, as far as it can be tested where `launch` is not installed: its tables against the nodes."""
+
+import ast
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LAUNCH = ROOT / "src/active6d_bringup/launch/active6d.launch.py"
+SYNTAX = ast.parse(LAUNCH.read_text())
+
+
+def table(name: str) -> ast.Dict:
+    """A dict at the top level of the launch file."""
+    return next(s.value for s in SYNTAX.body if isinstance(s, ast.Assign) and s.targets[0].id == name)
+
+
+def items(name: str) -> list[tuple[str, ast.expr]]:
+    """Key and unevaluated value of each entry."""
+    found = table(name)
+    return [(key.value, value) for key, value in zip(found.keys, found.values, strict=True)]
+
+
+def test_every_argument_has_a_description():
+    descriptions = {name: entry.elts[2].value for name, entry in items("ARGUMENTS")}
+    wanted = (
+        "object policy seed scene steps estimator camera record bag rviz namespace params_file autostart use_sim_time"
+    )
+    assert set(descriptions) == set(wanted.split())
+    assert all(len(description) > 10 for description in descriptions.values())
+
+
+def test_nodes_take_what_the_launch_file_gives(node):
+    package, given = ast.literal_eval(table("NODES")).get(node.get_name(), (None, []))
+    if package is None:
+        pytest.skip("not launched")
+    assert type(node).__module__ == f"{package}.nodes.{node.get_name()}"
+    types = {name: value.id for name, value in items("TYPES")}
+    for name in [*given, "autostart", "use_sim_time"]:
+        assert type(node.get_parameter(name).value).__name__ == types.get(name, "str"), name
+
+
+def test_every_executable_exists():
+    executables = ast.literal_eval(table("NODES"))
+    for executable, (package, _) in executables.items():
+        entry = f'"{executable} = {package}.nodes.{executable}:main"'
+        assert entry in (ROOT / "src" / package / "setup.py").read_text()
+    cameras = ast.literal_eval(table("CAMERAS"))
+    assert {name for names in cameras.values() for name in names} <= set(executables)
+
+
+def test_it_loads_where_launch_is_installed():
+    pytest.importorskip("launch_ros.actions", reason="launch comes with an apt installation of ROS 2")
+    names = runpy.run_path(str(LAUNCH))
+    arguments = names["generate_launch_description"]().get_launch_arguments()
+    assert {argument.name for argument in arguments} == set(names["ARGUMENTS"])

@@ -1,0 +1,126 @@
+"""package.xml, setup.py and the requirements against what the sources really import."""
+
+import ast
+import re
+import runpy
+import sys
+from pathlib import Path
+from unittest import mock
+
+import pytest
+from catkin_pkg.package import parse_package
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = sorted(path.name for path in (ROOT / "src").glob("active6d_*"))
+ROS = set(
+    "ament_index_python builtin_interfaces diagnostic_msgs geometry_msgs launch launch_ros lifecycle_msgs "
+    "rcl_interfaces rclpy rosgraph_msgs sensor_msgs std_msgs std_srvs visualization_msgs".split()
+)
+# import: (rosdep key, None where there is none or none without CUDA; name on PyPI)
+LIBRARIES = {
+    "PIL": ("python3-pil", "pillow"),
+    "contourpy": ("python3-matplotlib", "matplotlib"),
+    "gymnasium": ("python3-gymnasium-pip", "gymnasium"),
+    "jinja2": ("python3-jinja2", "jinja2"),
+    "matplotlib": ("python3-matplotlib", "matplotlib"),
+    "mcap": ("mcap-ros2-support", "mcap"),
+    "mcap_ros2": ("mcap-ros2-support", "mcap-ros2-support"),
+    "numpy": ("python3-numpy", "numpy"),
+    "open3d": ("python3-open3d-pip", "open3d-cpu"),
+    "pybullet": ("python3-pybullet-pip", "pybullet"),
+    "pybullet_data": ("python3-pybullet-pip", "pybullet"),
+    "pybullet_utils": ("python3-pybullet-pip", "pybullet"),
+    "rich": ("python3-rich", "rich"),
+    "rosbags": ("python3-rosbags-pip", "rosbags"),
+    "safetensors": (None, "safetensors"),
+    "scipy": ("python3-scipy", "scipy"),
+    "stable_baselines3": ("python3-stable-baselines3-pip", "stable-baselines3"),
+    "torch": (None, "torch"),
+    "trimesh": ("python3-trimesh-pip", "trimesh"),
+    "typer": ("python3-typer", "typer"),
+    "yaml": ("python3-yaml", "pyyaml"),
+}
+# `ros2 launch` itself
+NOT_IMPORTED = {"ros2launch"}
+
+
+def imports(package: str) -> set[str]:
+    """Top-level names that a package's sources and launch files import, the standard library and itself left out."""
+    names = set()
+    for path in [*(ROOT / "src" / package / package).rglob("*.py"), *(ROOT / "src" / package).glob("launch/*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names.add(node.module.split(".")[0])
+    return names - set(sys.stdlib_module_names) - {package}
+
+
+def setup_arguments(package: str) -> dict:
+    """What a package's setup.py hands to setuptools."""
+    with mock.patch("setuptools.setup") as setup, pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT / "src" / package)
+        runpy.run_path("setup.py")
+    return setup.call_args.kwargs
+
+
+def pins(name: str) -> dict[str, str]:
+    """Name and version of each requirement in a file."""
+    lines = (ROOT / name).read_text().splitlines()
+    return dict(re.fullmatch(r"([\w.-]+)==([\w.]+)", line).groups() for line in lines if line and line[0] not in "#-")
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_xml_declares_what_is_imported(package):
+    warnings = []
+    manifest = parse_package(ROOT / "src" / package / "package.xml", warnings=warnings)
+    manifest.validate(warnings=warnings)
+    assert not warnings
+    assert manifest.package_format == 3
+    assert manifest.get_build_type() == "ament_python"
+    imported = imports(package)
+    assert imported <= ROS | LIBRARIES.keys() | set(PACKAGES), "add new libraries to LIBRARIES"
+    keys = {LIBRARIES[name][0] if name in LIBRARIES else name for name in imported} - {None}
+    assert {dependency.name for dependency in manifest.exec_depends} - NOT_IMPORTED == keys
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_setup_py_agrees_with_package_xml(package):
+    manifest = parse_package(ROOT / "src" / package / "package.xml")
+    arguments = setup_arguments(package)
+    assert arguments["name"] == manifest.name == package
+    assert arguments["version"] == manifest.version
+    assert arguments["description"] == manifest.description
+    assert arguments["license"] == manifest.licenses[0]
+    libraries = {LIBRARIES[name][1] if name in LIBRARIES else name for name in imports(package) - ROS}
+    assert set(arguments["install_requires"]) == libraries
+
+
+def test_layers_of_the_packages():
+    allowed = {
+        "active6d_core": set(),
+        "active6d_sim": {"active6d_core"},
+        "active6d_perception": {"active6d_core"},
+        "active6d_agent": {"active6d_core", "active6d_perception"},
+        "active6d_bringup": set(PACKAGES),
+    }
+    for package in PACKAGES:
+        assert imports(package) & set(PACKAGES) <= allowed[package]
+
+
+def test_requirements_are_what_is_imported():
+    imported = set.union(*(imports(package) for package in PACKAGES)) & LIBRARIES.keys()
+    pinned = {name for name in pins("requirements.txt") if not name.startswith("ros-jazzy-")}
+    assert pinned == {LIBRARIES[name][1] for name in imported}
+
+
+def test_no_version_is_pinned_twice():
+    files = [pins(name) for name in ("requirements.txt", "requirements-dev.txt", "constraints.txt")]
+    assert len(set().union(*files)) == sum(map(len, files))
+
+
+def test_what_rosdep_has_no_key_for_is_in_the_docker_requirements():
+    imported = set.union(*(imports(package) for package in PACKAGES))
+    without_key = {LIBRARIES[name][1] for name in imported & LIBRARIES.keys() if LIBRARIES[name][0] is None}
+    lines = (ROOT / "docker/requirements.txt").read_text().splitlines()
+    assert without_key <= {re.split("[=<>]", line)[0] for line in lines}
