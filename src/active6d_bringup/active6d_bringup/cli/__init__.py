@@ -25,6 +25,8 @@ class CommandGroup(TyperGroup):
         except TyperException as error:
             context = getattr(error, "ctx", None) or ctx
             self._refuse(f"{error.format_message()} (see {context.command_path} --help)", error)
+        except BrokenPipeError:
+            raise
         # The packages say what is wrong with a name, a file or a parameter by these two, in one line.
         except (ValueError, OSError) as error:
             self._refuse(str(error), error)

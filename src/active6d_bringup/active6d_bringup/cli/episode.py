@@ -5,7 +5,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from active6d_bringup.cli.output import JsonFile, ObjectName, Seed, console, messages, progress_bar, write_json
+from active6d_bringup.cli.output import (
+    JsonFile,
+    ObjectName,
+    Overrides,
+    ParamsFile,
+    Processes,
+    Seed,
+    console,
+    messages,
+    progress_bar,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from active6d_bringup.episode import EpisodeResult, EpisodeSettings, EpisodeStep
@@ -26,12 +37,9 @@ def episode(
     report: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the HTML report of the bag; needs --bag.")
     ] = None,
-    processes: Annotated[bool, typer.Option("--processes", help="Run every node in a process of its own.")] = False,
-    params_file: Annotated[Path | None, typer.Option(metavar="FILE", help="ROS parameters of all nodes.")] = None,
-    override: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NODE.NAME=VALUE", help="One parameter of one node; repeatable."),
-    ] = None,
+    processes: Processes = False,
+    params_file: ParamsFile = None,
+    override: Overrides = None,
     json_file: JsonFile = None,
 ) -> None:
     """Let the graph look at a heap, think and move, once: the same seed gives the same episode.

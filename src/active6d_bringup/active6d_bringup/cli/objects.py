@@ -112,10 +112,10 @@ def add(
     try:
         write_file(description_path, yaml.safe_dump(description, sort_keys=False))
         model = read_description(description_path)
-    except Exception:
+    except Exception as error:  # readers of meshes raise many kinds on damaged files
         description_path.unlink(missing_ok=True)
         mesh_path.unlink()
-        raise
+        raise ValueError(f"{mesh} cannot be added: {error}") from error
     console.print(f"added {name}: {1e3 * model.diameter:.1f} mm in diameter", highlight=False, markup=False)
     folders = os.environ.get("ACTIVE6D_OBJECT_PATH", "").split(os.pathsep)
     if str(into) not in folders and str(into.resolve()) not in folders:

@@ -19,6 +19,13 @@ messages = Console(stderr=True)
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured to this file.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
 ObjectName = Annotated[str, typer.Option("--object", help="Object to work on, see `active6d object list`.")]
+BagFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a recorded bag.")]
+BagObject = Annotated[str | None, typer.Option("--object", help="The object, where the bag does not name it.")]
+Processes = Annotated[bool, typer.Option("--processes", help="Run every node in a process of its own.")]
+ParamsFile = Annotated[Path | None, typer.Option(metavar="FILE", help="ROS parameters of all nodes.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="NODE.NAME=VALUE", help="A parameter of a node; repeatable.")
+]
 
 _VERSIONS = ("numpy", "scipy", "open3d", "pybullet", "torch", "rclpy")
 

@@ -1,19 +1,28 @@
 """``active6d replay``."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from active6d_bringup.cli.episode import parse_overrides
-from active6d_bringup.cli.output import JsonFile, console, progress_bar, write_json
+from active6d_bringup.cli.output import (
+    BagFolder,
+    BagObject,
+    JsonFile,
+    Overrides,
+    ParamsFile,
+    Processes,
+    console,
+    progress_bar,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from active6d_bringup.replay import ReplayResult, ReplaySettings
 
 
 def replay(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a recorded bag.")],
+    folder: BagFolder,
     rate: Annotated[float, typer.Option(min=1e-3, help="Speed against the recording's.")] = 1.0,
     as_fast: Annotated[
         bool, typer.Option("--as-fast", help="Send a view as soon as the objects of the last one are there.")
@@ -21,17 +30,11 @@ def replay(
     compare: Annotated[
         bool, typer.Option("--compare", help="Exit with 1 unless hypotheses and objects equal the recorded ones.")
     ] = False,
-    object_name: Annotated[
-        str | None, typer.Option("--object", help="The object, where the bag does not name it.")
-    ] = None,
+    object_name: BagObject = None,
     estimator: Annotated[str | None, typer.Option(help="Another estimator than the recorded one.")] = None,
-    record: Annotated[Path | None, typer.Option(metavar="DIR", help="Record the replay into this new folder.")] = None,
-    processes: Annotated[bool, typer.Option("--processes", help="Run every node in a process of its own.")] = False,
-    params_file: Annotated[Path | None, typer.Option(metavar="FILE", help="ROS parameters of all nodes.")] = None,
-    override: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NODE.NAME=VALUE", help="One parameter of one node; repeatable."),
-    ] = None,
+    processes: Processes = False,
+    params_file: ParamsFile = None,
+    override: Overrides = None,
     json_file: JsonFile = None,
 ) -> None:
     """Send a bag's camera through live perception.
@@ -50,7 +53,6 @@ def replay(
         processes=processes,
         params_file=params_file,
         overrides=parse_overrides(override or []),
-        record=record,
     )
     result = _run(settings)
     console.print(f"{result.views} views in {result.seconds:.1f} s", highlight=False)

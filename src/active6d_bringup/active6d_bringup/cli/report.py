@@ -5,21 +5,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_bringup.cli.output import JsonFile, console, messages, write_file, write_json
+from active6d_bringup.cli.output import BagFolder, BagObject, JsonFile, console, messages, write_file, write_json
 
 if TYPE_CHECKING:
     from active6d_bringup.report.analysis import EpisodeAnalysis
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a recorded bag.")],
+    folder: BagFolder,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="The HTML file; DIR/report.html by default.")
     ] = None,
     png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the episode as one picture, too.")] = None,
-    object_name: Annotated[
-        str | None, typer.Option("--object", help="The object, where the bag does not name it.")
-    ] = None,
+    object_name: BagObject = None,
     episode: Annotated[int, typer.Option(min=0, help="Which episode of a bag with several, from 0.")] = 0,
     json_file: JsonFile = None,
 ) -> None:
@@ -30,7 +28,7 @@ def report(
     from active6d_bringup.bag import read_episodes
     from active6d_bringup.report.analysis import analyse
 
-    with messages.status(f"reading {folder}"):
+    with messages.status("reading the bag"):
         records = read_episodes(folder)
         if episode >= len(records):
             raise ValueError(f"--episode {episode}: {folder} holds {len(records)}, counted from 0")
@@ -72,12 +70,9 @@ def print_summary(analysis: "EpisodeAnalysis") -> None:
     for column in [*columns, *(["found", "e_ADD mm"] if known else [])]:
         table.add_column(column, justify="right", header_style="dim")
     for step in analysis.steps:
+        truth = step.truth
         attended = f"#{step.attended.index} ({step.attended.verification:.2f})" if step.attended else "-"
-        scored = (
-            [f"{step.truth.detected.sum()}/{len(step.truth.detected)}", f"{step.truth.mean_e_add_mm:.1f}"]
-            if known
-            else []
-        )
+        scored = [f"{truth.detected.sum()}/{len(truth.detected)}", f"{truth.mean_e_add_mm:.1f}"] if truth else []
         table.add_row(
             str(step.number),
             f"{step.azimuth:.0f}°",
