@@ -47,7 +47,7 @@ class GraphNode(LifecycleNode):
         super().__init__(name, context=context, namespace=namespace, parameter_overrides=parameters)
         self._active = False
         self._failure: Exception | None = None
-        self._views = 0
+        self._views_measured = 0
         self._rejected = 0
         self._last_view_at: float | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 100)
@@ -135,7 +135,7 @@ class GraphNode(LifecycleNode):
         started = time.perf_counter()
         yield
         finished = time.perf_counter()
-        self._views += 1
+        self._views_measured += 1
         values = {"latency_ms": f"{(finished - started) * 1e3:.3f}"}
         if self._last_view_at is not None:
             values["rate_hz"] = f"{1.0 / max(finished - self._last_view_at, 1e-9):.3f}"
@@ -143,7 +143,7 @@ class GraphNode(LifecycleNode):
         self._diagnose(DiagnosticStatus.OK, "view processed", stamp, values)
 
     def _diagnose(self, level: bytes, message: str, stamp: int, values: dict[str, str]) -> None:
-        values = {**values, "views": str(self._views), "rejected": str(self._rejected)}
+        values = {**values, "views": str(self._views_measured), "rejected": str(self._rejected)}
         status = DiagnosticStatus(
             level=level, name=self.get_fully_qualified_name(), message=message, hardware_id="active6d"
         )

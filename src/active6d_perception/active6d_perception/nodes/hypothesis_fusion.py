@@ -37,7 +37,7 @@ class HypothesisFusionNode(GraphNode):
         self._object = self.declare("object", "mug", "name of the object that the hypotheses are of")
         self._epsilon = self.declare("epsilon", 0.010, "threshold of the verification score, metres", minimum=1e-4)
         self._samples = self.declare("samples", 128, "most scene points verified per hypothesis", minimum=1)
-        self._parameters = FusionParameters(
+        self._fusion_parameters = FusionParameters(
             cut=self.declare(
                 "cut", FusionParameters.cut, "clusters are cut at this fraction of the diameter", minimum=1e-3
             ),
@@ -73,7 +73,7 @@ class HypothesisFusionNode(GraphNode):
         """Load the object and precompute its views."""
         model = load_object(self._object)
         self._verifier = Verifier(model, self._epsilon, self._samples)
-        self._fusion = SceneFusion(model, self._parameters)
+        self._fusion = SceneFusion(model, self._fusion_parameters)
         self._mesh_uri = export_mesh(model)
 
     def _on_hypotheses(self, message: PointCloud2) -> None:
