@@ -29,11 +29,11 @@ class BagPlayerNode(GraphNode):
         self._rate = self.declare(
             "rate", 0.0, "speed against the recording's; 0 waits for the objects of each view instead", minimum=0.0
         )
-        self._publishers = {}
+        self._outputs = {}
         for topic in _REPLAYED:
             package, _, name = topic.type.split("/")
             message_type = getattr(import_module(f"{package}.msg"), name)
-            self._publishers[topic.name] = self.output(message_type, topic.name, latched=True)
+            self._outputs[topic.name] = self.output(message_type, topic.name, latched=True)
         self._end = self.output(DiagnosticArray, END, latched=True)
         self.input(PointCloud2, "objects", self._on_objects, latched=True)
         self._timer: Timer | None = None
@@ -76,7 +76,7 @@ class BagPlayerNode(GraphNode):
         stamp = self._stamps[self._next]
         with self.measure(stamp):
             for topic, payload in self._views[stamp].items():
-                self._publishers[topic].publish(payload)
+                self._outputs[topic].publish(payload)
         self._next += 1
         if self._rate > 0:
             following = self._stamps[min(self._next, len(self._stamps) - 1)]

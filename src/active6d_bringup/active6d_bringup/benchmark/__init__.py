@@ -1,0 +1,1 @@
+"""What ``active6d benchmark`` measures."""
