@@ -1,20 +1,19 @@
 """Multi-view fusion: all hypotheses so far, clustered in the world; the best verified of each cluster is an object.
 
-The functions :func:`cluster`, :func:`select` and :func:`project_features` are pure and know nothing of messages or
-history, so a training environment calls the same ones on precomputed tables. :class:`SceneFusion` keeps the history.
+:func:`cluster`, :func:`select` and :func:`project_features` are pure and know nothing of messages or history, so a
+training environment calls the same ones on precomputed tables. :class:`SceneFusion` keeps the history.
 Paper, "Multi-view hypotheses fusion" and "Objects feature representation".
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.cluster.hierarchy import linkage
-from scipy.spatial.distance import squareform
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert
+from active6d_perception.clustering import cluster, suppress_neighbours
 from active6d_perception.model_views import ModelViews, model_views
 from active6d_perception.symmetric_distance import SymmetricDistance
 
@@ -47,33 +46,6 @@ class FusionParameters:
             raise ValueError(f"fusion: min_verification must be in [-1, 1], got {self.min_verification}")
 
 
-def cluster(distance: np.ndarray, cut: float) -> np.ndarray:
-    """Hierarchical clustering with average linkage.
-
-    Average linkage merges two clusters by the mean over all their pairs: single linkage would chain neighbouring
-    objects through stray hypotheses between them, and complete linkage would split an object by its worst hypothesis.
-
-    Args:
-        distance: (k, k) symmetric, metres.
-        cut: metres; clusters whose mean distance is above it stay apart.
-
-    Returns:
-        (k,) cluster of each item, from 0.
-    """
-    count = len(distance)
-    if count < 2:
-        return np.zeros(count, int)
-    tree = linkage(squareform(distance, checks=False), "average")
-    merges = np.searchsorted(tree[:, 2], cut, side="right")
-    # Each merge makes a node that its two parts point to; following the pointers to their ends gives the clusters.
-    # scipy's fcluster does the same and takes longer over its argument checks than linkage over the tree.
-    node = np.arange(count + merges)
-    node[tree[:merges, :2].astype(np.intp)] = np.arange(count, count + merges)[:, None]
-    while not np.array_equal(node, further := node[node]):
-        node = further
-    return np.unique(node[:count], return_inverse=True)[1]
-
-
 def select(labels: np.ndarray, positions: np.ndarray, exclusion: float) -> np.ndarray:
     """The best of each cluster that shares its place with no better one.
 
@@ -86,11 +58,7 @@ def select(labels: np.ndarray, positions: np.ndarray, exclusion: float) -> np.nd
         (n,) indices, best first.
     """
     best = np.sort(np.unique(labels, return_index=True)[1])
-    apart = np.linalg.norm(positions[best][:, None] - positions[best][None], axis=-1) >= exclusion
-    kept = np.ones(len(best), bool)
-    for index in range(1, len(best)):
-        kept[index] = apart[index, :index][kept[:index]].all()
-    return best[kept]
+    return best[suppress_neighbours(positions[best][None], np.ones((1, len(best)), bool), exclusion)[0]]
 
 
 def summarise(
@@ -139,7 +107,9 @@ def project_features(
     """
     R, t = T_camera_object[:, :3, :3], T_camera_object[:, :3, 3]
     # Coordinates before points, so that each is one contiguous row: several times faster than the other way round.
-    x, y, z = np.moveaxis((R.reshape(-1, 3) @ views.outline.T).reshape(len(R), 3, -1) + t[..., None], 1, 0)
+    x, y, z = np.moveaxis(
+        (R.reshape(-1, 3) @ views.outline.T).reshape(len(R), 3, len(views.outline)) + t[..., None], 1, 0
+    )
     z = np.maximum(z, 1e-3)
     u = (camera.fx * (x / z) + (camera.cx + 0.5)) / camera.width
     v = (camera.fy * (y / z) + (camera.cy + 0.5)) / camera.height

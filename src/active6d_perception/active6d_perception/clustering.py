@@ -1,0 +1,102 @@
+"""Average-linkage clustering of many small groups at once, and suppression of neighbours.
+
+The fusion node clusters one scene at a time, the agent's training environment hundreds at a time; both call these
+functions, so that they cannot disagree.
+"""
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+
+def cluster_groups(distance: np.ndarray, valid: np.ndarray, cut: float) -> np.ndarray:
+    """Hierarchical clustering with average linkage within each of B groups.
+
+    Average linkage merges two clusters by the mean over all their pairs: single linkage would chain neighbouring
+    objects through stray hypotheses between them, and complete linkage would split an object by its worst hypothesis.
+
+    Args:
+        distance: (B, m, m) symmetric, metres.
+        valid: (B, m) bool, which items exist; the others are padding.
+        cut: metres; clusters whose mean distance is above it stay apart.
+
+    Returns:
+        (B, m) cluster of each item, named by its first item.
+    """
+    size = valid.shape[1]
+    labels = np.tile(np.arange(size), (len(valid), 1))
+    pairs = valid[:, :, None] & valid[:, None, :]
+    # Where all distances are within the cut, all means are.
+    tight = np.where(pairs, distance, 0.0).max(axis=(1, 2), initial=0.0) <= cut
+    labels[tight] = np.where(valid[tight], valid[tight].argmax(axis=1)[:, None], labels[tight])
+    groups = np.flatnonzero(~tight)
+    table = np.where(pairs[groups] & ~np.eye(size, dtype=bool), distance[groups], np.inf)
+    weight, label = np.ones((len(groups), size)), labels[groups]
+    while len(groups):
+        flat = table.reshape(len(groups), -1)
+        nearest = flat.argmin(axis=1)
+        open_ = flat[np.arange(len(groups)), nearest] <= cut
+        if not open_.all():
+            labels[groups[~open_]] = label[~open_]
+            groups, table, weight = groups[open_], table[open_], weight[open_]
+            label, nearest = label[open_], nearest[open_]
+        row = np.arange(len(groups))
+        # The first of equal entries lies above the diagonal, so the earlier item keeps its name.
+        first, second = np.divmod(nearest, size)
+        share = weight[row, first] / (weight[row, first] + weight[row, second])
+        merged = share[:, None] * table[row, first] + (1.0 - share)[:, None] * table[row, second]
+        table[row, first], table[row, :, first] = merged, merged
+        table[row, second], table[row, :, second] = np.inf, np.inf
+        weight[row, first] += weight[row, second]
+        label = np.where(label == second[:, None], first[:, None], label)
+    return labels
+
+
+def cluster(distance: np.ndarray, cut: float) -> np.ndarray:
+    """:func:`cluster_groups` of (k, k) distances in metres; (k,) cluster of each item, named by its first item."""
+    count = len(distance)
+    labels = np.arange(count)
+    # No mean over distances above the cut is below it, so clusters lie within components of the near pairs.
+    _, component = connected_components(csr_array(distance <= cut), directed=False)
+    members, valid = group(component)
+    blocks = distance[members[:, :, None], members[:, None, :]]
+    local = cluster_groups(blocks, valid, cut)
+    labels[members[valid]] = np.take_along_axis(members, local, axis=1)[valid]
+    return labels
+
+
+def group(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Items with equal keys, one group per row.
+
+    Args:
+        keys: (k,) integers.
+
+    Returns:
+        (B, m) indices of the items of each group, rising, padded with any; (B, m) bool, which are not padding.
+    """
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1 if not len(keys) else keys[order[0]] - 1))
+    sizes = np.diff(starts, append=len(keys))
+    place = np.arange(sizes.max(initial=0))
+    valid = place < sizes[:, None]
+    return order[np.minimum(starts[:, None] + place, max(len(keys) - 1, 0))], valid
+
+
+def suppress_neighbours(positions: np.ndarray, valid: np.ndarray, exclusion: float) -> np.ndarray:
+    """Which items have no better one that stays within ``exclusion`` of them, in each of B lists.
+
+    Args:
+        positions: (B, n, 3) metres, best item first.
+        valid: (B, n) bool, which items exist.
+        exclusion: metres.
+
+    Returns:
+        (B, n) bool, which stay.
+    """
+    kept = valid.copy()
+    squared = ((positions[:, :, None] - positions[:, None]) ** 2).sum(axis=-1)
+    close = (squared < exclusion**2) & np.tri(positions.shape[1], k=-1, dtype=bool)
+    # Only what has a neighbour ahead can fall, and only in list order is it known which of those stay.
+    for index in np.flatnonzero((close & valid[:, None]).any(axis=(0, 2))):
+        kept[:, index] &= ~(close[:, index] & kept).any(axis=1)
+    return kept
