@@ -39,7 +39,7 @@ def make_objects(T: np.ndarray, verification: np.ndarray) -> SceneObjects:
 def make_record(
     *, truth: bool = True, info: dict[str, str] | None = None, node: str = "pose_estimator"
 ) -> EpisodeRecord:
-    """Four mugs far from each other; every estimate is off by a translation, so its e_ADD is the translation's length."""
+    """Four mugs far from each other; each estimate is off by a translation, so its e_ADD is that one's length."""
     sphere = ViewSphere()
     centers = np.array([(x, y, 0.05) for x in (-0.12, 0.12) for y in (-0.12, 0.12)])
     T_true = make_transform(np.eye(3), centers)
@@ -232,7 +232,7 @@ def area(polygons: list[np.ndarray]) -> float:
 def test_silhouette_of_a_ball_is_its_disc(ball):
     camera = PinholeCamera.from_field_of_view(640, 480, 60.0)
     T = make_transform(np.eye(3), (0.0, 0.0, 0.8))
-    # The cone that touches a ball of radius r at distance z meets the picture in a disc of radius f r / sqrt(z^2 - r^2).
+    # The cone that touches a ball of radius r at distance z meets the picture in a disc of radius f r / sqrt(z² - r²).
     expected = np.pi * (camera.fx * 0.05 / np.sqrt(0.8**2 - 0.05**2)) ** 2
     outline = SilhouetteDrawer(ball).outline(T, camera)
     assert area(outline.full) == pytest.approx(expected, rel=0.02)
