@@ -44,8 +44,8 @@ class ModelViews:
         self.normals = np.asarray(model.mesh.face_normals[faces], np.float32)
         self.spacing = float(np.sqrt(model.mesh.area / len(points) / np.pi))
         self.directions = np.asarray(trimesh.creation.icosphere(_SUBDIVISIONS).vertices)
-        eyes = self.directions * (_EYE_DISTANCE * model.diameter)
-        self.visible = visible_from(model.mesh, eyes, self.points, self.normals)
+        self._eye_distance = _EYE_DISTANCE * model.diameter
+        self.visible = visible_from(model.mesh, self.directions * self._eye_distance, self.points, self.normals)
         self._trees: dict[int, tuple[np.ndarray, cKDTree]] = {}
         self._subsets: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         hull = np.asarray(model.mesh.convex_hull.vertices)
@@ -58,8 +58,11 @@ class ModelViews:
 
     @cached_property
     def centroids(self) -> np.ndarray:
-        """(m, 3) mean of the visible surface per direction, each part weighted by the area it shows to the eye."""
-        weight = self.visible * np.maximum(self.directions @ self.normals.T, 0.0)
+        """(m, 3) mean of the visible surface per direction, each part weighted by the area it covers in the image."""
+        eyes = self.directions * self._eye_distance
+        facing = eyes @ self.normals.T - np.einsum("si,si->s", self.normals, self.points)
+        square_distance = self._eye_distance**2 + (self.points**2).sum(axis=1) - 2 * eyes @ self.points.T
+        weight = self.visible * np.maximum(facing, 0.0) / square_distance**1.5
         return weight @ self.points / weight.sum(axis=1, keepdims=True)
 
     def visible_tree(self, direction: int) -> tuple[np.ndarray, cKDTree]:

@@ -4,11 +4,13 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from active6d_core.camera import PinholeCamera
 from active6d_core.conversions import (
     MessageError,
     hypotheses_from_cloud,
@@ -22,7 +24,6 @@ from active6d_core.conversions import (
     require_frame,
     stamp_to_ns,
 )
-from active6d_core.hypotheses import SceneObjects
 from active6d_core.node import GraphNode, StampSynchronizer, run_node
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_perception.fusion import FusionParameters, SceneFusion
@@ -56,18 +57,19 @@ class HypothesisFusionNode(GraphNode):
             ),
         )
         latched = self.declare("latched_camera", True, "camera topics are transient-local, false for plain drivers")
-        self._published: tuple[int, SceneObjects] | None = None
+        self._latest: tuple[int, np.ndarray, PinholeCamera] | None = None
         self._objects = self.output(PointCloud2, "objects", latched=True)
         self._poses = self.output(PoseArray, "objects/poses", latched=True)
         self._markers = self.output(MarkerArray, "objects/markers", latched=True)
         names = ("hypotheses", "segmentation", "depth", "camera", "pose")
         self._views = StampSynchronizer(names, self._on_view)
+        # First, for the executor calls back in this order: a new episode is known before its first view.
+        self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
         self.input(PointCloud2, "hypotheses", self._on_hypotheses, latched=True)
         self.input(Image, "hypotheses/segmentation", self._on_segmentation, latched=True)
         self.input(Image, "camera/depth/image_raw", self._on_depth, latched)
         self.input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
         self.input(PoseStamped, "camera/pose", self._on_pose, latched)
-        self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
 
     def setup(self) -> None:
         """Load the object and precompute its views."""
@@ -78,15 +80,15 @@ class HypothesisFusionNode(GraphNode):
 
     def _on_hypotheses(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
-        if self._published is not None and stamp == self._published[0]:
+        if self._is_latest(stamp):
             self._publish()  # a restarted estimator repeats its last view; whoever awaits the result gets it again
-            return
-        self._views.add("hypotheses", stamp, message)
+        else:
+            self._views.add("hypotheses", stamp, message)
 
     def _on_segmentation(self, message: Image) -> None:
         require_frame(message.header, self.camera_frame)
         stamp = stamp_to_ns(message.header.stamp)
-        if self._published is None or stamp != self._published[0]:
+        if not self._is_latest(stamp):
             self._views.add("segmentation", stamp, image_to_segmentation(message))
 
     def _on_depth(self, message: Image) -> None:
@@ -101,7 +103,10 @@ class HypothesisFusionNode(GraphNode):
         self._views.add("pose", stamp_to_ns(message.header.stamp), pose_stamped_to_transform(message, self.world_frame))
 
     def _on_episode_start(self, message: DiagnosticArray) -> None:
-        self._fusion.forget_before(stamp_to_ns(message.header.stamp))
+        start = stamp_to_ns(message.header.stamp)
+        self._fusion.forget_before(start)
+        if self._latest is not None and self._latest[0] >= start:
+            self._publish()  # the first view overtook the announcement of its episode
 
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
         camera, depth, segmentation = values["camera"], values["depth"], values["segmentation"]
@@ -112,11 +117,15 @@ class HypothesisFusionNode(GraphNode):
         with self.measure(stamp):
             verification = self._verifier.score(depth, camera, hypotheses)
             self._fusion.add_view(stamp, values["pose"], hypotheses, verification)
-            self._published = stamp, self._fusion.objects(stamp, values["pose"], camera)
+            self._latest = stamp, values["pose"], camera
             self._publish()
 
+    def _is_latest(self, stamp: int) -> bool:
+        return self._latest is not None and stamp == self._latest[0]
+
     def _publish(self) -> None:
-        stamp, objects = self._published
+        stamp = self._latest[0]
+        objects = self._fusion.objects(*self._latest)
         self._objects.publish(objects_to_cloud(objects, stamp, self.world_frame))
         self._poses.publish(poses_to_array(objects.T_world_object, stamp, self.world_frame))
         self._markers.publish(objects_to_markers(objects, self._mesh_uri, stamp, self.world_frame))

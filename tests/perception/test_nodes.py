@@ -1,0 +1,320 @@
+"""The estimator and fusion nodes: what they publish, and that bad input is refused while they live on."""
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseArray
+from sensor_msgs.msg import Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from active6d_core.camera import DEFAULT_CAMERA
+from active6d_core.conversions import (
+    camera_to_info,
+    color_to_image,
+    depth_to_image,
+    hypotheses_from_cloud,
+    hypotheses_to_cloud,
+    image_to_segmentation,
+    ns_to_stamp,
+    objects_from_cloud,
+    segmentation_to_image,
+    stamp_to_ns,
+    transform_to_pose_stamped,
+)
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.object_model import load_object
+from active6d_core.se3 import make_transform
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.estimator import register_estimator
+from active6d_perception.fusion import SceneFusion
+from active6d_perception.nodes.hypothesis_fusion import HypothesisFusionNode
+from active6d_perception.nodes.pose_estimator import PoseEstimatorNode
+from active6d_perception.verification import Verifier
+
+FRAME = "camera_optical_frame"
+CAMERA = DEFAULT_CAMERA.scaled(0.25)
+SPHERE = ViewSphere()
+SECOND = 1_000_000_000
+
+
+@register_estimator("nearest-pixel")
+class NearestPixel:
+    """One hypothesis at the nearest pixel, so that a node's test does not wait for a real estimator."""
+
+    def __init__(self, model, weight=1.0):
+        self.weight = weight
+
+    def estimate(self, view):
+        if not np.isfinite(view.depth).any():
+            return Hypotheses.empty(view.camera.height, view.camera.width)
+        mask = (view.depth < np.nanmin(view.depth) + 0.05).astype(np.uint16)
+        T = np.eye(4)
+        T[2, 3] = np.nanmin(view.depth)
+        return Hypotheses.from_masks(T[None], np.array([self.weight]), np.ones(1), mask, view.depth)
+
+
+def make_depth():
+    depth = np.full((CAMERA.height, CAMERA.width), 0.8, np.float32)
+    depth[50:70, 60:90] = 0.7
+    return depth
+
+
+def camera_messages(stamp, depth=None):
+    depth = make_depth() if depth is None else depth
+    return {
+        "camera/color/image_raw": color_to_image(np.zeros((*depth.shape, 3), np.uint8), stamp, FRAME),
+        "camera/depth/image_raw": depth_to_image(depth, stamp, FRAME),
+        "camera/color/camera_info": camera_to_info(CAMERA, stamp, FRAME),
+        "camera/pose": transform_to_pose_stamped(SPHERE.pose(SPHERE.positions[3]), stamp, "world"),
+    }
+
+
+ESTIMATOR_INPUTS = tuple(camera_messages(1))[:3]
+
+
+def send(graph, messages, topics=None):
+    for topic in topics or messages:
+        graph.publish(topic, messages[topic], latched=topic.startswith(("camera", "hypotheses")))
+
+
+@pytest.fixture
+def estimator(graph):
+    return graph.add(PoseEstimatorNode(context=graph.context, overrides={"estimator": "nearest-pixel"}))
+
+
+def test_estimator_publishes_what_the_estimator_says(graph, estimator):
+    hypotheses, poses = (
+        graph.mailbox(PointCloud2, "hypotheses", True),
+        graph.mailbox(PoseArray, "hypotheses/poses", True),
+    )
+    masks, diagnostics = (
+        graph.mailbox(Image, "hypotheses/segmentation", True),
+        graph.mailbox(DiagnosticArray, "/diagnostics"),
+    )
+    send(graph, camera_messages(SECOND), ESTIMATOR_INPUTS)
+    graph.spin_until_filled([hypotheses, poses, masks, diagnostics])
+    segmentation = image_to_segmentation(masks[0])
+    found = hypotheses_from_cloud(hypotheses[0], segmentation, FRAME)
+    assert [stamp_to_ns(message.header.stamp) for message in (hypotheses[0], poses[0], masks[0])] == [SECOND] * 3
+    np.testing.assert_array_equal(segmentation == 1, make_depth() < 0.75)
+    np.testing.assert_allclose(found.box[0], [60 / 160, 50 / 120, 90 / 160, 70 / 120], atol=1e-6)
+    assert found.depth[0] == pytest.approx(0.7)
+    assert poses[0].poses[0].position.z == pytest.approx(0.7)
+    assert diagnostics[0].status[0].level == DiagnosticStatus.OK
+
+
+def wrong_encoding(messages):
+    messages["camera/depth/image_raw"].encoding = "rgb8"
+
+
+def wrong_bytes(messages):
+    messages["camera/depth/image_raw"].data = messages["camera/depth/image_raw"].data[:-4]
+
+
+def wrong_size(messages):
+    messages["camera/color/camera_info"] = camera_to_info(DEFAULT_CAMERA, SECOND, FRAME)
+
+
+def wrong_frame(messages):
+    messages["camera/color/image_raw"].header.frame_id = "elsewhere"
+
+
+@pytest.mark.parametrize("spoil", [wrong_encoding, wrong_bytes, wrong_size, wrong_frame])
+def test_estimator_refuses_bad_views_and_takes_the_next(graph, estimator, spoil):
+    hypotheses, diagnostics = (
+        graph.mailbox(PointCloud2, "hypotheses", True),
+        graph.mailbox(DiagnosticArray, "/diagnostics"),
+    )
+    messages = camera_messages(SECOND)
+    spoil(messages)
+    send(graph, messages, ESTIMATOR_INPUTS)
+    graph.spin_until(lambda: any(d.status[0].level == DiagnosticStatus.ERROR for d in diagnostics))
+    assert not hypotheses
+    send(graph, camera_messages(2 * SECOND), ESTIMATOR_INPUTS)
+    graph.spin_until_filled([hypotheses])
+    assert stamp_to_ns(hypotheses[0].header.stamp) == 2 * SECOND
+
+
+def test_estimator_waits_for_camera_info_and_refuses_old_stamps(graph, estimator):
+    hypotheses, diagnostics = (
+        graph.mailbox(PointCloud2, "hypotheses", True),
+        graph.mailbox(DiagnosticArray, "/diagnostics"),
+    )
+    send(graph, camera_messages(SECOND), ESTIMATOR_INPUTS[:2])
+    graph.spin_for(0.2)
+    assert not hypotheses
+    send(graph, camera_messages(2 * SECOND), ESTIMATOR_INPUTS)
+    graph.spin_until_filled([hypotheses])
+    for stamp, kind in ((2 * SECOND, "duplicate"), (SECOND, "stale")):
+        diagnostics.clear()
+        send(graph, camera_messages(stamp), ESTIMATOR_INPUTS[:1])
+        graph.spin_until(lambda kind=kind: any(kind in d.status[0].message for d in diagnostics))
+    assert len(hypotheses) == 1
+
+
+def test_a_view_without_depth_has_no_hypothesis(graph, estimator):
+    hypotheses = graph.mailbox(PointCloud2, "hypotheses", True)
+    send(graph, camera_messages(SECOND, np.full((120, 160), np.nan, np.float32)), ESTIMATOR_INPUTS)
+    graph.spin_until_filled([hypotheses])
+    assert hypotheses[0].width == 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "text"),
+    [
+        ({"estimator": "psychic"}, "estimator"),
+        ({"estimator_parameters": "[1]"}, "estimator_parameters"),
+        ({"estimator_parameters": "{colour: 1}"}, "no parameter 'colour'"),
+        ({"object": "teapot"}, "unknown object 'teapot'"),
+    ],
+)
+def test_bad_estimator_parameters_are_named(graph, overrides, text):
+    with pytest.raises(ValueError, match=text):
+        graph.add(PoseEstimatorNode(context=graph.context, overrides={"estimator": "nearest-pixel", **overrides}))
+
+
+# Fusion
+
+
+@pytest.fixture(scope="module")
+def seen(render):
+    """Depth and hypotheses of a mug 0.75 m before the camera."""
+    model = load_object("mug")
+    T = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.75])[None]
+    depth, _ = render(model, T, CAMERA)
+    mask = np.isfinite(depth).astype(np.uint16)
+    return depth, Hypotheses.from_masks(T, np.array([0.9]), np.ones(1), mask, depth)
+
+
+def fusion_messages(seen, stamp):
+    depth, hypotheses = seen
+    return {
+        **camera_messages(stamp, depth),
+        "hypotheses": hypotheses_to_cloud(hypotheses, stamp, FRAME),
+        "hypotheses/segmentation": segmentation_to_image(hypotheses.segmentation, stamp, FRAME),
+    }
+
+
+FUSION_INPUTS = (
+    "camera/depth/image_raw",
+    "camera/color/camera_info",
+    "camera/pose",
+    "hypotheses/segmentation",
+    "hypotheses",
+)
+
+
+@pytest.fixture
+def fusion(graph, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return graph.add(HypothesisFusionNode(context=graph.context))
+
+
+def test_fusion_publishes_verified_objects(graph, fusion, seen, tmp_path):
+    objects, poses = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(PoseArray, "objects/poses", True)
+    markers = graph.mailbox(MarkerArray, "objects/markers", True)
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects, poses, markers])
+    depth, hypotheses = seen
+    model = load_object("mug")
+    T_world_camera = SPHERE.pose(SPHERE.positions[3])
+    core = SceneFusion(model)
+    core.add_view(SECOND, T_world_camera, hypotheses, Verifier(model).score(depth, CAMERA, hypotheses))
+    expected = core.objects(SECOND, T_world_camera, CAMERA)
+    published = objects_from_cloud(objects[0], "world")
+    for name in ("T_world_object", "verification", "score", "box", "depth", "support", "spread"):
+        np.testing.assert_allclose(getattr(published, name), getattr(expected, name), atol=1e-4, err_msg=name)
+    assert published.verification[0] > 0.8
+    assert len(poses[0].poses) == 1
+    assert markers[0].markers[1].mesh_resource == (tmp_path / "active6d/meshes/mug.stl").as_uri()
+    assert (tmp_path / "active6d/meshes/mug.stl").stat().st_size > 1000
+
+
+def test_the_same_view_again_changes_nothing(graph, fusion, seen):
+    objects = graph.mailbox(PointCloud2, "objects", True)
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects])
+    send(graph, fusion_messages(seen, SECOND), ("hypotheses/segmentation", "hypotheses"))
+    graph.spin_until_filled([objects], 2)
+    assert bytes(objects[0].data) == bytes(objects[1].data)
+    assert objects[0].header == objects[1].header
+
+
+def test_a_new_episode_forgets_the_last(graph, fusion, seen):
+    objects = graph.mailbox(PointCloud2, "objects", True)
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
+    send(graph, fusion_messages(seen, 2 * SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects], 2)
+    assert objects_from_cloud(objects[1], "world").support[0] == 2
+    start = DiagnosticArray(status=[DiagnosticStatus()])
+    start.header.stamp = ns_to_stamp(3 * SECOND)
+    graph.publish("episode/start", start, latched=True)
+    send(graph, fusion_messages(seen, 3 * SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects], 3)
+    assert objects_from_cloud(objects[2], "world").support[0] == 1
+
+
+def zero_quaternion(messages):
+    messages["camera/pose"].pose.orientation.w = 0.0
+    for axis in "xyz":
+        setattr(messages["camera/pose"].pose.orientation, axis, 0.0)
+
+
+def unknown_frame(messages):
+    messages["camera/pose"].header.frame_id = "map"
+
+
+def hypotheses_of_nan(messages):
+    table = np.frombuffer(bytes(messages["hypotheses"].data), np.uint8).copy()
+    table[:4] = np.frombuffer(np.float32(np.nan).tobytes(), np.uint8)
+    messages["hypotheses"].data = table.tobytes()
+
+
+def mask_of_another_size(messages):
+    messages["hypotheses/segmentation"] = segmentation_to_image(np.ones((4, 4), np.uint16), SECOND, FRAME)
+
+
+def mask_encoding(messages):
+    messages["hypotheses/segmentation"].encoding = "mono8"
+
+
+def short_table(messages):
+    messages["hypotheses"].data = messages["hypotheses"].data[:-1]
+
+
+@pytest.mark.parametrize(
+    "spoil", [zero_quaternion, unknown_frame, hypotheses_of_nan, mask_of_another_size, mask_encoding, short_table]
+)
+def test_fusion_refuses_bad_input_and_takes_the_next(graph, fusion, seen, spoil):
+    objects, diagnostics = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(DiagnosticArray, "/diagnostics")
+    messages = fusion_messages(seen, SECOND)
+    spoil(messages)
+    send(graph, messages, FUSION_INPUTS)
+    graph.spin_until(lambda: any(d.status[0].level == DiagnosticStatus.ERROR for d in diagnostics))
+    assert not objects
+    send(graph, fusion_messages(seen, 2 * SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects])
+    assert objects_from_cloud(objects[0], "world").support[0] == 1
+
+
+def test_fusion_refuses_stale_views(graph, fusion, seen):
+    objects, diagnostics = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(DiagnosticArray, "/diagnostics")
+    send(graph, fusion_messages(seen, 2 * SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects])
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS[:1])
+    graph.spin_until(lambda: any("stale" in d.status[0].message for d in diagnostics))
+    assert len(objects) == 1
+
+
+def test_nan_depth_verifies_to_nothing(graph, fusion, seen):
+    objects = graph.mailbox(PointCloud2, "objects", True)
+    messages = fusion_messages(seen, SECOND)
+    messages["camera/depth/image_raw"] = depth_to_image(np.full((120, 160), np.nan, np.float32), SECOND, FRAME)
+    send(graph, messages, FUSION_INPUTS)
+    graph.spin_until_filled([objects])
+    assert objects_from_cloud(objects[0], "world").verification[0] == 0.0
+
+
+def test_bad_fusion_parameters_are_named(graph):
+    with pytest.raises(ValueError, match="'epsilon'"):
+        HypothesisFusionNode(context=graph.context, overrides={"epsilon": -1.0})
