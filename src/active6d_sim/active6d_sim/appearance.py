@@ -1,0 +1,97 @@
+"""What a scene looks like: colours, textures and lights. Geometry is elsewhere."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+TEXTURE_SIZE = 512
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Colours are linear RGB in [0, 1]; directions point from the scene to the light (any length), in the world.
+
+    Attributes:
+        object_color: of all instances; None takes the model's.
+        color_variation: standard deviation of each instance's own tint and brightness, relative.
+        shininess: strength of the highlight on objects, 0 is matt.
+        bin_color: of the tray.
+        table_color: of the table, before its texture.
+        table_contrast: relative standard deviation of the table's texture.
+        grain: (across, along) smoothness of the table's texture in texels of 2 mm; unequal numbers look like wood.
+        key_direction: of the light that casts shadows.
+        key_color: its colour times strength.
+        fill_direction: of a second, shadowless light.
+        fill_color: its colour times strength.
+        ambient_color: of light from everywhere, dimmed in crevices.
+        backdrop: colour above the horizon.
+        seed: of the instances' tints and of the textures.
+    """
+
+    object_color: tuple[float, float, float] | None = None
+    color_variation: float = 0.06
+    shininess: float = 0.25
+    bin_color: tuple[float, float, float] = (0.10, 0.15, 0.22)
+    table_color: tuple[float, float, float] = (0.46, 0.31, 0.19)
+    table_contrast: float = 0.14
+    grain: tuple[float, float] = (1.2, 60.0)
+    key_direction: tuple[float, float, float] = (0.45, -0.55, 1.0)
+    key_color: tuple[float, float, float] = (0.95, 0.90, 0.82)
+    fill_direction: tuple[float, float, float] = (-0.7, 0.5, 0.5)
+    fill_color: tuple[float, float, float] = (0.13, 0.16, 0.20)
+    ambient_color: tuple[float, float, float] = (0.34, 0.36, 0.40)
+    backdrop: tuple[float, float, float] = (0.62, 0.67, 0.72)
+    seed: int = 0
+
+    @classmethod
+    def random(cls, rng: np.random.Generator, vary_object_color: float = 0.15) -> "Appearance":
+        """Random lights, colours and textures, for training data.
+
+        Args:
+            rng: source of randomness.
+            vary_object_color: how far the objects' hue and brightness may leave the model's colour, relative.
+        """
+        azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(25, 85))
+        key = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
+        strength, warmth = rng.uniform(0.4, 1.4), rng.uniform(-0.15, 0.15)
+        return cls(
+            color_variation=rng.uniform(0.0, 0.12) + vary_object_color * rng.uniform(0.0, 1.0),
+            shininess=rng.uniform(0.0, 0.6),
+            bin_color=tuple(rng.uniform(0.02, 0.8, 3)),
+            table_color=tuple(rng.uniform(0.05, 0.8, 3)),
+            table_contrast=rng.uniform(0.0, 0.4),
+            grain=tuple(np.exp(rng.uniform(np.log(0.8), np.log(60.0), 2))),
+            key_direction=key,
+            key_color=tuple(strength * np.array([1 + warmth, 1.0, 1 - warmth])),
+            fill_direction=tuple(rng.normal(size=2)) + (0.5,),
+            fill_color=tuple(rng.uniform(0.0, 0.3, 3)),
+            ambient_color=tuple(rng.uniform(0.15, 0.5) * rng.uniform(0.85, 1.15, 3)),
+            backdrop=tuple(rng.uniform(0.1, 0.9, 3)),
+            seed=int(rng.integers(2**31)),
+        )
+
+    def with_seed(self, seed: int) -> "Appearance":
+        """The same look with other tints and textures."""
+        return replace(self, seed=seed)
+
+    def instance_colors(self, count: int, model_color: np.ndarray) -> np.ndarray:
+        """(count, 3) float32 linear colour of each instance; ``model_color`` is sRGB as in the object's description."""
+        rng = np.random.default_rng([self.seed, 1])
+        base = np.array(model_color) ** 2.2 if self.object_color is None else np.array(self.object_color)
+        brightness = 1 + self.color_variation * rng.normal(size=(count, 1))
+        tint = 1 + 0.5 * self.color_variation * rng.normal(size=(count, 3))
+        return np.clip(base * brightness * tint, 0.01, 1.0).astype(np.float32)
+
+    def textures(self) -> np.ndarray:
+        """(2, TEXTURE_SIZE, TEXTURE_SIZE) float32 factors that tile: the table's grain, and the bin's fine speckle."""
+        rng = np.random.default_rng([self.seed, 2])
+        table = sum(_tiling_noise(rng, np.multiply(self.grain, scale)) * weight for scale, weight in ((1, 1), (4, 0.7)))
+        bin_speckle = 0.04 * _tiling_noise(rng, (1.0, 1.0))
+        factors = np.stack([1 + self.table_contrast * table / 1.22, 1 + bin_speckle])
+        return np.clip(factors, 0.2, 1.8).astype(np.float32)
+
+
+def _tiling_noise(rng: np.random.Generator, sigma: tuple[float, float]) -> np.ndarray:
+    noise = gaussian_filter(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE)).astype(np.float32), sigma, mode="wrap")
+    return noise / noise.std()

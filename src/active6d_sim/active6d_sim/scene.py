@@ -1,0 +1,120 @@
+"""A scene: objects at rest in a bin. The world's origin is the centre of the bin's floor, z up, metres."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import is_rigid
+
+
+@dataclass(frozen=True)
+class Bin:
+    """An open tray. Its floor is at z = 0; the table that it stands on is one wall thickness below.
+
+    Attributes:
+        inner_width: along world x, metres.
+        inner_depth: along world y, metres.
+        wall_height: of the inner walls above the floor, metres; 0 is a plate without walls.
+        wall_thickness: of walls and floor, metres.
+    """
+
+    inner_width: float
+    inner_depth: float
+    wall_height: float
+    wall_thickness: float = 0.008
+
+    def __post_init__(self) -> None:
+        sizes = (self.inner_width, self.inner_depth, self.wall_thickness)
+        if not (np.isfinite(sizes).all() and min(sizes) > 0 and 0 <= self.wall_height < np.inf):
+            raise ValueError(f"bin sizes must be positive and finite, got {self}")
+
+    @classmethod
+    def for_model(cls, model: ObjectModel) -> "Bin":
+        """The square bin in which the model's usual number of instances lies one and a half to two layers deep.
+
+        The floor's area is that of the instances, each counted as the cube of its convex hull's volume, times 0.9: then
+        objects hide each other, but the heap neither towers nor leaves the default camera's picture (`docs/scenes.md`).
+        """
+        footprint = float(model.mesh.convex_hull.volume) ** (2 / 3)
+        width = round(float(np.sqrt(0.9 * np.mean(model.instances) * footprint)), 2)
+        return cls(width, width, round(0.5 * model.diameter, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Identical objects at rest in a bin.
+
+    Attributes:
+        object_name: of the object's description.
+        name: ``mug/test/3`` for a stored scene, ``mug/seed/7`` for one that was dropped on demand.
+        seed: of the drop.
+        T_world_object: (n, 4, 4) poses of the ground truth's objects, metres.
+        bin: the tray they lie in.
+        visible_fraction: (M, n) share of each object's silhouette seen from each view of the default grid, in [0, 1].
+        T_world_hidden: (h, 4, 4) poses of objects that are physically there (and rendered) but belong to no ground
+            truth, since no view of the grid shows enough of them.
+
+    Raises:
+        ValueError: shapes disagree or a pose is not rigid.
+    """
+
+    object_name: str
+    name: str
+    seed: int
+    T_world_object: np.ndarray
+    bin: Bin
+    visible_fraction: np.ndarray
+    T_world_hidden: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+
+    def __post_init__(self) -> None:
+        for poses in (self.T_world_object, self.T_world_hidden):
+            if poses.ndim != 3 or not is_rigid(poses):
+                raise ValueError(f"scene {self.name}: poses must be rigid (n, 4, 4) transforms")
+        if self.visible_fraction.ndim != 2 or self.visible_fraction.shape[1] != len(self):
+            raise ValueError(
+                f"scene {self.name}: visible_fraction has shape {self.visible_fraction.shape}, expected (M, {len(self)})"
+            )
+
+    def __len__(self) -> int:
+        return len(self.T_world_object)
+
+    @property
+    def T_world_all(self) -> np.ndarray:
+        """(n + h, 4, 4) poses of everything in the bin, the ground truth's objects first."""
+        return np.concatenate([self.T_world_object, self.T_world_hidden])
+
+    def save(self, path: Path) -> None:
+        """Write the scene as one compressed ``.npz`` without pickled data."""
+        np.savez_compressed(
+            path,
+            object_name=self.object_name,
+            name=self.name,
+            seed=self.seed,
+            T_world_object=self.T_world_object,
+            T_world_hidden=self.T_world_hidden,
+            bin=[self.bin.inner_width, self.bin.inner_depth, self.bin.wall_height, self.bin.wall_thickness],
+            visible_fraction=self.visible_fraction.astype(np.float32),
+        )
+
+    @classmethod
+    def load(cls, path: Path) -> "Scene":
+        """Read a file that :meth:`save` wrote.
+
+        Raises:
+            ValueError: the file is missing, damaged or not a scene; the message names it.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                return cls(
+                    str(data["object_name"]),
+                    str(data["name"]),
+                    int(data["seed"]),
+                    data["T_world_object"],
+                    Bin(*data["bin"].tolist()),
+                    data["visible_fraction"],
+                    data["T_world_hidden"],
+                )
+        except Exception as error:  # numpy raises many kinds on damaged archives
+            raise ValueError(f"{path}: not a stored scene ({error})") from error

@@ -1,0 +1,118 @@
+"""Views with ground truth to learn a pose estimator from: random heaps, bins, looks, cameras and sensor noise.
+
+Nothing here is a stored scene: heaps are dropped from their own range of seeds, which :func:`training_heap` checks
+against the seeds of every stored scene.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from active6d_core.camera import PinholeCamera, View
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import invert, look_at, make_transform
+from active6d_sim.appearance import Appearance
+from active6d_sim.heap import drop_heap
+from active6d_sim.renderer import RenderedView, SceneRenderer
+from active6d_sim.scene import Bin, Scene
+from active6d_sim.scene_store import SPLITS, load_scene
+from active6d_sim.sensor import SensorNoise, apply
+
+#: Heaps to learn from are dropped from seeds at or above this one; stored scenes and episodes use smaller ones.
+FIRST_SEED = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingView:
+    """One view as a sensor would see it, and the truth at a quarter of its resolution.
+
+    Attributes:
+        view: noisy colour and depth.
+        truth: what is really there, as ``view.camera.scaled(truth_scale)`` sees it.
+        T_camera_object: (n, 4, 4) poses of everything in the bin; ``truth.instance`` indexes them.
+        visible_fraction: (n,) share of each silhouette inside the picture that nothing covers.
+    """
+
+    view: View
+    truth: RenderedView
+    T_camera_object: np.ndarray
+    visible_fraction: np.ndarray
+
+
+def training_heap(model: ObjectModel, seed: int) -> Scene:
+    """Drop a random heap: from a single object to the model's usual number and a few more, in a bin with or without walls.
+
+    Raises:
+        ValueError: ``seed`` is below :data:`FIRST_SEED`, or a stored scene has it.
+    """
+    if seed < FIRST_SEED:
+        raise ValueError(f"heaps to learn from need a seed of at least {FIRST_SEED}, got {seed}")
+    if seed in stored_seeds(model):
+        raise ValueError(f"seed {seed} belongs to a stored scene of {model.name}")
+    rng = np.random.default_rng([seed, 1])
+    most = model.instances[1]
+    count = int(rng.integers(model.instances[0], most + 3) if rng.random() < 0.7 else rng.integers(1, most))
+    usual = Bin.for_model(model)
+    width, depth = usual.inner_width * rng.uniform(0.85, 1.25, 2)
+    height = 0.0 if rng.random() < 0.25 else usual.wall_height * rng.uniform(0.3, 1.5)
+    return drop_heap(model, seed, count=count, bin=Bin(width, depth, height), name=f"{model.name}/training/{seed}")
+
+
+def stored_seeds(model: ObjectModel) -> frozenset[int]:
+    """Seeds of all stored scenes of an object; empty for an object that has none."""
+    seeds = set()
+    for split, count in SPLITS.items():
+        for index in range(count):
+            try:
+                seeds.add(load_scene(model.name, split, index).seed)
+            except ValueError:
+                break
+    return frozenset(seeds)
+
+
+def random_camera(rng: np.random.Generator, width: int = 640, height: int = 480) -> tuple[PinholeCamera, np.ndarray]:
+    """Intrinsics, and a (4, 4) ``T_world_camera`` that looks about at the bin from anywhere above the table.
+
+    Most cameras stand upright, as on the view hemisphere; a fifth are turned about their axis at will.
+    """
+    camera = PinholeCamera.from_field_of_view(width, height, rng.uniform(56.0, 64.0))
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(np.sin(np.radians(12)), 1.0))
+    direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    T_world_camera = look_at(rng.uniform(0.55, 1.05) * direction, rng.normal(0.0, (0.04, 0.04, 0.02)))
+    roll = rng.uniform(-np.pi, np.pi) if rng.random() < 0.2 else rng.normal(0.0, 0.15)
+    return camera, T_world_camera @ make_transform(Rotation.from_euler("z", roll).as_matrix(), np.zeros(3))
+
+
+def training_views(
+    scene: Scene, model: ObjectModel, count: int, rng: np.random.Generator, *, truth_scale: float = 0.25, threads: int = 0
+) -> Iterator[TrainingView]:
+    """``count`` views of a heap, each pair of them with another look, camera and strength of noise (up to doubled)."""
+    renderer = None
+    for index in range(count):
+        if index % 4 == 0:
+            renderer = SceneRenderer(scene, model=model, appearance=Appearance.random(rng), threads=threads)
+        camera, T_world_camera = random_camera(rng)
+        yield training_view(renderer, camera, T_world_camera, SensorNoise().scaled(rng.uniform(0, 2)), rng, truth_scale)
+
+
+def training_view(
+    renderer: SceneRenderer,
+    camera: PinholeCamera,
+    T_world_camera: np.ndarray,
+    noise: SensorNoise,
+    rng: np.random.Generator,
+    truth_scale: float = 0.25,
+) -> TrainingView:
+    """Render one view, as the sensor sees it and as it is."""
+    rendered = renderer.render(T_world_camera, camera)
+    color, depth = apply(rendered, camera, noise, rng)
+    coarse = camera.scaled(truth_scale)
+    visible, whole = renderer.instance_layers(T_world_camera, coarse)
+    return TrainingView(
+        View(0, color, depth, camera, T_world_camera),
+        renderer.render(T_world_camera, coarse),
+        invert(T_world_camera) @ renderer.scene.T_world_all,
+        np.divide(visible, whole, out=np.zeros(len(visible)), where=whole > 0),
+    )
