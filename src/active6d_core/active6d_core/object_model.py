@@ -181,8 +181,7 @@ def _read_symmetry(description: dict) -> Symmetry:
         if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
             raise ValueError("symmetry.axis needs three numbers, not all zero")
         axis = axis / np.linalg.norm(axis)
-    # The identity, which is in every group, stands in for none: SciPy before 1.16 has no empty Rotation.
-    rotation_vectors = np.array(description.get("discrete_rotvec_degrees") or np.zeros((1, 3)), float).reshape(-1, 3)
+    rotation_vectors = np.array(description.get("discrete_rotvec_degrees") or np.zeros((0, 3)), float).reshape(-1, 3)
     return Symmetry(axis, _generate_group(Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix()))
 
 
