@@ -16,7 +16,7 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     python_requires=">=3.11",
-    install_requires=["active6d_core", "active6d_perception", "numpy", "pyyaml"],
+    install_requires=["active6d_core", "active6d_perception", "gymnasium", "numpy", "pyyaml"],
     entry_points={
         "console_scripts": [
             "attention_policy = active6d_agent.nodes.attention_policy:main",

@@ -33,6 +33,7 @@ setup(
         "rich",
         "rosbags",
         "scipy",
+        "torch",
         "typer",
     ],
     entry_points={

@@ -16,7 +16,17 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     python_requires=">=3.11",
-    install_requires=["active6d_core", "numpy", "open3d-cpu", "pyyaml", "safetensors", "scipy", "torch", "trimesh"],
+    install_requires=[
+        "active6d_core",
+        "matplotlib",
+        "numpy",
+        "open3d-cpu",
+        "pyyaml",
+        "safetensors",
+        "scipy",
+        "torch",
+        "trimesh",
+    ],
     entry_points={
         "console_scripts": [
             "pose_estimator = active6d_perception.nodes.pose_estimator:main",

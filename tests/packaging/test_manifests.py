@@ -16,7 +16,7 @@ ROS = set(
     "ament_index_python builtin_interfaces diagnostic_msgs geometry_msgs launch launch_ros lifecycle_msgs "
     "rcl_interfaces rclpy rosgraph_msgs sensor_msgs std_msgs std_srvs visualization_msgs".split()
 )
-# import: (rosdep key, None where there is none or none without CUDA; name on PyPI)
+# import: (rosdep key, None where there is none that is new enough and without CUDA; name on PyPI)
 LIBRARIES = {
     "PIL": ("python3-pil", "pillow"),
     "contourpy": ("python3-matplotlib", "matplotlib"),
@@ -30,14 +30,14 @@ LIBRARIES = {
     "pybullet": ("python3-pybullet-pip", "pybullet"),
     "pybullet_data": ("python3-pybullet-pip", "pybullet"),
     "pybullet_utils": ("python3-pybullet-pip", "pybullet"),
-    "rich": ("python3-rich", "rich"),
+    "rich": (None, "rich"),
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "safetensors": (None, "safetensors"),
-    "scipy": ("python3-scipy", "scipy"),
+    "scipy": (None, "scipy"),
     "stable_baselines3": ("python3-stable-baselines3-pip", "stable-baselines3"),
     "torch": (None, "torch"),
     "trimesh": ("python3-trimesh-pip", "trimesh"),
-    "typer": ("python3-typer", "typer"),
+    "typer": (None, "typer"),
     "yaml": ("python3-yaml", "pyyaml"),
 }
 # `ros2 launch` itself
