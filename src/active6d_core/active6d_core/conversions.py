@@ -78,9 +78,7 @@ def pose_to_transform(pose: Pose) -> np.ndarray:
 
 def transform_to_pose(T: np.ndarray) -> Pose:
     """(4, 4) to a Pose."""
-    x, y, z = (float(value) for value in T[:3, 3])
-    qx, qy, qz, qw = (float(value) for value in quaternion_from_transform(T))
-    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+    return _transforms_to_poses(T[None])[0]
 
 
 def pose_stamped_to_transform(message: PoseStamped, frame: str) -> np.ndarray:
@@ -100,7 +98,7 @@ def transform_to_pose_stamped(T: np.ndarray, stamp: int, frame: str) -> PoseStam
 
 def poses_to_array(T: np.ndarray, stamp: int, frame: str) -> PoseArray:
     """(n, 4, 4) to a PoseArray."""
-    return PoseArray(header=make_header(stamp, frame), poses=[transform_to_pose(pose) for pose in T])
+    return PoseArray(header=make_header(stamp, frame), poses=_transforms_to_poses(T))
 
 
 def poses_from_array(message: PoseArray, frame: str) -> np.ndarray:
@@ -110,7 +108,18 @@ def poses_from_array(message: PoseArray, frame: str) -> np.ndarray:
         MessageError: another frame, or a bad pose.
     """
     require_frame(message.header, frame)
-    return np.array([pose_to_transform(pose) for pose in message.poses]).reshape(-1, 4, 4)
+    rows = [(p.position, p.orientation) for p in message.poses]
+    return _rows_to_transforms(np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w] for p, q in rows]).reshape(-1, 7))
+
+
+def _transforms_to_poses(T: np.ndarray) -> list[Pose]:
+    """(n, 4, 4) to n Poses; all quaternions at once, which costs what a single one would."""
+    if not len(T):
+        return []
+    return [
+        Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+        for (x, y, z), (qx, qy, qz, qw) in zip(T[:, :3, 3].tolist(), quaternion_from_transform(T).tolist(), strict=True)
+    ]
 
 
 def _rows_to_transforms(rows: np.ndarray) -> np.ndarray:
@@ -392,10 +401,11 @@ def _read_box(table: np.ndarray) -> np.ndarray:
 def objects_to_markers(objects: SceneObjects, mesh_uri: str, stamp: int, frame: str) -> MarkerArray:
     """One mesh per object, from red (verification score 0) to green (1), after one marker that clears the last ones."""
     markers = [Marker(header=make_header(stamp, frame), action=Marker.DELETEALL)]
-    for index, (T, verification) in enumerate(zip(objects.T_world_object, objects.verification, strict=True)):
+    poses = _transforms_to_poses(objects.T_world_object)
+    for index, (pose, verification) in enumerate(zip(poses, objects.verification, strict=True)):
         marker = Marker(header=make_header(stamp, frame), ns="objects", id=index, type=Marker.MESH_RESOURCE)
         marker.mesh_resource = mesh_uri
-        marker.pose = transform_to_pose(T)
+        marker.pose = pose
         marker.scale.x = marker.scale.y = marker.scale.z = 1.0
         certainty = float(np.clip(verification, 0.0, 1.0))
         marker.color = ColorRGBA(r=1.0 - certainty, g=certainty, b=0.1, a=0.8)
