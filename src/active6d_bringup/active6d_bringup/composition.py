@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 #: Node name to its module and class. Their order is the order of starting: who listens comes before who speaks.
@@ -101,7 +101,7 @@ class ComposedGraph:
         self._description = description
         self._on_event = on_event
         self.context = open_context(description)
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = EventsExecutor(context=self.context)
         self.nodes: dict[str, Node] = {}
         self._guests: list[Node] = []
 

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from active6d_bringup.composition import NODES, GraphDescription, OnEvent, open_context
 
 #: Nodes that an episode survives: they find their inputs again as latched messages.
-RESTARTED = ("attention_policy", "hypothesis_fusion", "pose_estimator")
+RESTARTED = ("hypothesis_fusion", "pose_estimator")
 _RESTARTS = 5
 _START_SECONDS = 60.0
 _STOP_SECONDS = 15.0

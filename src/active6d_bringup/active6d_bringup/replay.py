@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -161,9 +162,7 @@ def describe(settings: ReplaySettings, recorded_object: str | None) -> GraphDesc
     name = settings.object or recorded_object
     if name is None:
         raise BagError(f"{settings.bag}: does not name its object; say which it is with --object")
-    with open_bag(settings.bag) as reader:
-        kept = (reader.metadata.custom or {}).get(SETTINGS, "{}")
-    told = _read_settings(kept)
+    told = _read_settings(settings.bag)
     estimator = {**told.get("pose_estimator", {}), "object": name}
     if settings.estimator is not None:
         estimator["estimator"] = settings.estimator
@@ -214,11 +213,12 @@ def _table(message: Any) -> np.ndarray:
     return np.frombuffer(message.data.tobytes(), np.dtype(layout))
 
 
-def _read_settings(text: str) -> dict[str, dict[str, Any]]:
-    """What the nodes were told when recording; nothing where the bag's text makes no sense."""
+def _read_settings(folder: Path) -> dict[str, dict[str, Any]]:
+    """What the nodes were told when recording; nothing where the bag's metadata does not say."""
+    metadata = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     try:
-        settings = json.loads(text)
-    except json.JSONDecodeError:
+        settings = json.loads((metadata.get("custom_data") or {})[SETTINGS])
+    except (KeyError, TypeError, json.JSONDecodeError):
         return {}
     if not isinstance(settings, dict):
         return {}

@@ -1,0 +1,107 @@
+"""A camera and an estimator that answer at once, for tests of the graph's running rather than of its parts."""
+
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseArray, PoseStamped
+from sensor_msgs.msg import CameraInfo, Image
+
+from active6d_core.camera import PinholeCamera, View
+from active6d_core.conversions import (
+    camera_to_info,
+    color_to_image,
+    depth_to_image,
+    make_header,
+    pose_stamped_to_transform,
+    poses_to_array,
+    transform_to_pose_stamped,
+)
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.node import GraphNode, run_node
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import make_transform
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.estimator import list_estimators, register_estimator
+
+CAMERA = PinholeCamera.from_field_of_view(64, 48, 60.0)
+
+
+class StubCameraNode(GraphNode):
+    """Goes to every goal at once and sees seeded noise there."""
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__("camera_simulator", **arguments)
+        self._object = self.declare("object", "mug", "what to say that it sees")
+        self._seed = self.declare("seed", 0, "of the noise")
+        self._deaf_from = self.declare("deaf_from", -1, "number of the first goal that is ignored, -1 for none")
+        self._pose = ViewSphere().pose(ViewSphere().positions[self._seed % 100])
+        self._count = 0
+        self._color = self.output(Image, "camera/color/image_raw", latched=True)
+        self._depth = self.output(Image, "camera/depth/image_raw", latched=True)
+        self._info = self.output(CameraInfo, "camera/color/camera_info", latched=True)
+        self._where = self.output(PoseStamped, "camera/pose", latched=True)
+        self._truth = self.output(PoseArray, "ground_truth/poses", latched=True)
+        self._start = self.output(DiagnosticArray, "episode/start", latched=True)
+        self.input(PoseStamped, "view_goal", self._on_goal)
+
+    def begin(self) -> None:
+        """Announce the episode and publish the first view."""
+        status = DiagnosticStatus(name="episode", message="started")
+        values = {"object": self._object, "scene": f"{self._object}/seed/{self._seed}", "seed": str(self._seed)}
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        self._start.publish(DiagnosticArray(header=make_header(10**9, self.world_frame), status=[status]))
+        self._truth.publish(poses_to_array(np.eye(4)[None], 10**9, self.world_frame))
+        self._publish()
+
+    def _on_goal(self, message: PoseStamped) -> None:
+        self._count += 1
+        if self._count != self._deaf_from:
+            self._pose = pose_stamped_to_transform(message, self.world_frame)
+            self._publish()
+
+    def _publish(self) -> None:
+        stamp = 10**9 + self._count * 500_000_000
+        with self.measure(stamp):
+            rng = np.random.default_rng([self._seed, stamp])
+            depth = rng.uniform(0.6, 0.9, (CAMERA.height, CAMERA.width)).astype(np.float32)
+            color = rng.integers(0, 256, (*depth.shape, 3)).astype(np.uint8)
+            self._color.publish(color_to_image(color, stamp, self.camera_frame))
+            self._depth.publish(depth_to_image(depth, stamp, self.camera_frame))
+            self._info.publish(camera_to_info(CAMERA, stamp, self.camera_frame))
+            self._where.publish(transform_to_pose_stamped(self._pose, stamp, self.world_frame))
+
+
+class StubEstimator:
+    """One hypothesis per quarter of the image, at the mean depth of the quarter's pixels nearer than 0.75 m.
+
+    Args:
+        model: not used.
+        offset: metres added to every depth.
+    """
+
+    def __init__(self, model: ObjectModel, offset: float = 0.0) -> None:
+        self._offset = offset
+
+    def estimate(self, view: View) -> Hypotheses:
+        """A function of the view alone."""
+        rows, columns = np.indices(view.depth.shape)
+        quarter = 1 + 2 * (rows >= CAMERA.height // 2) + (columns >= CAMERA.width // 2)
+        segmentation = np.where(view.depth < 0.75, quarter, 0).astype(np.uint16)
+        depth = np.array([view.depth[segmentation == label].mean() for label in range(1, 5)]) + self._offset
+        directions = np.array([[-0.2, -0.15, 1], [0.2, -0.15, 1], [-0.2, 0.15, 1], [0.2, 0.15, 1]])
+        T = make_transform(np.broadcast_to(np.eye(3), (4, 3, 3)), directions * depth[:, None])
+        return Hypotheses.from_masks(T, np.full(4, 0.5), np.arange(1, 5), segmentation, view.depth)
+
+
+if "stub" not in list_estimators():
+    register_estimator("stub")(StubEstimator)
+
+
+def main() -> None:
+    """Entry point."""
+    run_node(StubCameraNode)
+
+
+if __name__ == "__main__":
+    main()
