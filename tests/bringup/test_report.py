@@ -12,7 +12,7 @@ from PIL import Image
 
 from active6d_bringup.bag import EpisodeRecord, RecordedStep
 from active6d_bringup.report.analysis import analyse
-from active6d_bringup.report.drawing import depth_to_color, score_color
+from active6d_bringup.report.drawing import ScoreScale, depth_to_color
 from active6d_bringup.report.figure import render_png
 from active6d_bringup.report.page import render_html
 from active6d_bringup.report.silhouette import SilhouetteDrawer
@@ -265,8 +265,12 @@ def test_silhouette_outside_the_picture_is_empty(ball, position):
 
 
 def test_colors():
-    assert score_color(-1.0) == score_color(0.0) != score_color(1.0) == score_color(2.0)
-    assert score_color(float("nan")) == "#9aa0a6"
+    scale = ScoreScale.around(np.array([0.42, 0.61, 0.77, np.nan]))
+    assert (scale.low, scale.high) == (pytest.approx(0.4), pytest.approx(0.8))
+    assert scale.color(0.1) == scale.color(0.4) != scale.color(0.8) == scale.color(0.9)
+    assert scale.color(float("nan")) == "#9aa0a6"
+    assert ScoreScale.around(np.zeros(0)) == ScoreScale(0.0, 1.0)
+    assert ScoreScale.around(np.full(3, 0.5)).high > 0.5
     depth = np.array([[np.nan, 0.5], [0.75, 1.0]], np.float32)
     picture, (near, far) = depth_to_color(depth)
     assert picture[0, 0].tolist() == [0, 0, 0]

@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 from PIL import Image
 
-from active6d_bringup.report.analysis import StepAnalysis
+from active6d_bringup.report.analysis import EpisodeAnalysis, StepAnalysis
 from active6d_bringup.report.silhouette import Outline, SilhouetteDrawer
 from active6d_core.se3 import invert
 
@@ -16,13 +16,43 @@ from active6d_core.se3 import invert
 _SCORE_COLORS = np.array([(255, 61, 200), (255, 214, 61), (46, 230, 166)], float)
 
 
-def score_color(score: float) -> str:
-    """``#rrggbb`` of a score in [0, 1]: magenta through amber to green, clipped outside; grey for NaN."""
-    if not np.isfinite(score):
-        return "#9aa0a6"
-    position = np.clip(score, 0.0, 1.0) * (len(_SCORE_COLORS) - 1)
-    red, green, blue = (np.interp(position, range(len(_SCORE_COLORS)), channel) for channel in _SCORE_COLORS.T)
-    return f"#{round(red):02x}{round(green):02x}{round(blue):02x}"
+@dataclass(frozen=True)
+class ScoreScale:
+    """Colours for scores between ``low`` and ``high``: magenta through amber to green, clipped outside."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def around(cls, scores: np.ndarray) -> "ScoreScale":
+        """The scale whose ends, multiples of 0.05, hold all (n,) scores but the lowest twentieth.
+
+        The scores of one episode often differ little, and over [0, 1] all of them would have one colour.
+        """
+        finite = scores[np.isfinite(scores)]
+        if not len(finite):
+            return cls(0.0, 1.0)
+        low = np.floor(20 * np.percentile(finite, 5)) / 20
+        high = np.ceil(20 * finite.max()) / 20
+        return cls(float(low), float(max(high, low + 0.05)))
+
+    def color(self, score: float) -> str:
+        """``#rrggbb``; grey for a score that is not finite."""
+        if not np.isfinite(score):
+            return "#9aa0a6"
+        share = np.clip((score - self.low) / (self.high - self.low), 0.0, 1.0)
+        steps = np.linspace(0.0, 1.0, len(_SCORE_COLORS))
+        red, green, blue = (round(float(np.interp(share, steps, channel))) for channel in _SCORE_COLORS.T)
+        return f"#{red:02x}{green:02x}{blue:02x}"
+
+    def ramp(self, count: int = 9) -> list[str]:
+        """Colours evenly from the low end to the high one."""
+        return [self.color(score) for score in np.linspace(self.low, self.high, count)]
+
+
+def score_scale(analysis: EpisodeAnalysis) -> ScoreScale:
+    """The scale of an episode's verification scores."""
+    return ScoreScale.around(np.array([row.verification for step in analysis.steps for row in step.rows]))
 
 
 def depth_to_color(depth: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:

@@ -13,7 +13,7 @@ from matplotlib.path import Path as Polygon
 from matplotlib.patheffects import withStroke
 
 from active6d_bringup.report.analysis import EpisodeAnalysis, StepAnalysis
-from active6d_bringup.report.drawing import StepOutlines, outline_step, score_color
+from active6d_bringup.report.drawing import ScoreScale, StepOutlines, outline_step, score_scale
 from active6d_bringup.report.silhouette import SilhouetteDrawer
 
 _MOST_VIEWS = 6
@@ -25,36 +25,36 @@ _FONT = {"font.family": "DejaVu Sans", "font.size": 9, "axes.edgecolor": "#c9d0d
 def render_png(analysis: EpisodeAnalysis) -> bytes:
     """PNG of up to six views (first, last, and evenly between), the camera's path and the course of the errors."""
     chosen = np.unique(np.linspace(0, len(analysis.steps) - 1, _MOST_VIEWS).round().astype(int))
-    drawer = SilhouetteDrawer(analysis.model)
+    drawer, scale = SilhouetteDrawer(analysis.model), score_scale(analysis)
     with matplotlib.rc_context(_FONT):
         figure = Figure(figsize=(13.4, 6.1), dpi=120, facecolor="white")
         grid = figure.add_gridspec(2, 3, left=0.01, right=0.715, top=0.9, bottom=0.015, wspace=0.03, hspace=0.11)
         for place, number in enumerate(chosen):
             step = analysis.steps[number]
             outlines = outline_step(drawer, step, analysis.record.ground_truth)
-            _draw_view(figure.add_subplot(grid[place // 3, place % 3]), step, outlines)
-        _draw_path(figure.add_axes((0.725, 0.5, 0.265, 0.42)), analysis)
+            _draw_view(figure.add_subplot(grid[place // 3, place % 3]), step, outlines, scale)
+        _draw_path(figure.add_axes((0.725, 0.5, 0.265, 0.42)), analysis, scale)
         _draw_course(figure.add_axes((0.755, 0.095, 0.21, 0.32)), analysis.steps)
-        _draw_title(figure, analysis)
+        _draw_title(figure, analysis, scale)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png")
     return buffer.getvalue()
 
 
-def _draw_title(figure: Figure, analysis: EpisodeAnalysis) -> None:
+def _draw_title(figure: Figure, analysis: EpisodeAnalysis, scale: ScoreScale) -> None:
     record = analysis.record
     figure.text(0.01, 0.965, record.scene or analysis.model.name, size=14, weight="bold", va="center")
     parts = [record.policy, f"{len(analysis.steps) - 1} moves", f"{analysis.distance_m:.2f} m"]
     figure.text(0.175, 0.965, "   ".join(part for part in parts if part), size=11, color=_SOFT, va="center")
-    scale = figure.add_axes((0.605, 0.958, 0.10, 0.016))
-    ramp = LinearSegmentedColormap.from_list("score", [score_color(value) for value in np.linspace(0, 1, 9)])
-    scale.imshow(np.linspace(0, 1, 256)[None], aspect="auto", cmap=ramp)
-    scale.set_axis_off()
-    figure.text(0.60, 0.966, "verification score  0", size=9, color=_SOFT, ha="right", va="center")
-    figure.text(0.71, 0.966, "1", size=9, color=_SOFT, va="center")
+    bar = figure.add_axes((0.585, 0.958, 0.09, 0.016))
+    ramp = LinearSegmentedColormap.from_list("score", scale.ramp())
+    bar.imshow(np.linspace(0, 1, 256)[None], aspect="auto", cmap=ramp)
+    bar.set_axis_off()
+    figure.text(0.58, 0.966, f"verification score  {scale.low:.2f}", size=9, color=_SOFT, ha="right", va="center")
+    figure.text(0.68, 0.966, f"{scale.high:.2f}", size=9, color=_SOFT, va="center")
 
 
-def _draw_view(axes: Axes, step: StepAnalysis, outlines: StepOutlines) -> None:
+def _draw_view(axes: Axes, step: StepAnalysis, outlines: StepOutlines, scale: ScoreScale) -> None:
     view = step.record.view
     axes.imshow(view.color, interpolation="antialiased")
     for row, outline in sorted(zip(step.rows, outlines.objects, strict=True), key=lambda pair: pair[0].attended):
@@ -62,7 +62,7 @@ def _draw_view(axes: Axes, step: StepAnalysis, outlines: StepOutlines) -> None:
             continue
         edge = withStroke(linewidth=5 if row.attended else 2.6, foreground="white" if row.attended else "#00000090")
         shape = Polygon.make_compound_path(*(Polygon(polygon, closed=True) for polygon in outline.visible))
-        color = score_color(row.verification)
+        color = scale.color(row.verification)
         axes.add_patch(PathPatch(shape, facecolor=color + "30", edgecolor="none"))
         axes.add_patch(PathPatch(shape, facecolor="none", edgecolor=color, linewidth=1.5, path_effects=[edge]))
     axes.set(xlim=(-0.5, view.camera.width - 0.5), ylim=(view.camera.height - 0.5, -0.5), xticks=[], yticks=[])
@@ -73,7 +73,7 @@ def _draw_view(axes: Axes, step: StepAnalysis, outlines: StepOutlines) -> None:
     axes.set_title(found, loc="right", size=9, color=_SOFT, pad=4)
 
 
-def _draw_path(axes: Axes, analysis: EpisodeAnalysis) -> None:
+def _draw_path(axes: Axes, analysis: EpisodeAnalysis, scale: ScoreScale) -> None:
     """The hemisphere in an orthographic projection: matplotlib's own 3D axes cut off what does not fit their box."""
     sphere, cameras = analysis.sphere, analysis.record.positions
     azimuth, elevation = np.radians(-50.0), np.radians(28.0)
@@ -89,7 +89,7 @@ def _draw_path(axes: Axes, analysis: EpisodeAnalysis) -> None:
     last = analysis.steps[-1]
     centers = last.objects.T_world_object[:, :3, 3]
     nearest_last = np.argsort(centers @ toward)
-    colors = [score_color(last.rows[i].verification) for i in nearest_last]
+    colors = [scale.color(last.rows[i].verification) for i in nearest_last]
     axes.scatter(*(centers[nearest_last] @ projection).T, s=80, c=colors, linewidths=0, alpha=0.9)
     for start, end in pairwise(cameras):
         axes.plot(*(_arc(start, end, sphere.radius) @ projection).T, color=_ACCENT, lw=2.2, solid_capstyle="round")

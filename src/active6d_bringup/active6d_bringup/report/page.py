@@ -7,7 +7,14 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from active6d_bringup.report.analysis import EpisodeAnalysis, StepAnalysis
-from active6d_bringup.report.drawing import StepOutlines, data_uri, depth_to_color, outline_step, score_color
+from active6d_bringup.report.drawing import (
+    ScoreScale,
+    StepOutlines,
+    data_uri,
+    depth_to_color,
+    outline_step,
+    score_scale,
+)
 from active6d_bringup.report.silhouette import Outline, SilhouetteDrawer
 
 _CHART_WIDTH, _CHART_HEIGHT = 300.0, 130.0
@@ -39,8 +46,8 @@ def render_html(analysis: EpisodeAnalysis) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"path": svg_path, "color": score_color}
-    drawer = SilhouetteDrawer(analysis.model)
+    environment.filters["path"] = svg_path
+    drawer, scale = SilhouetteDrawer(analysis.model), score_scale(analysis)
     truth = analysis.record.ground_truth
     return environment.get_template("report.html.j2").render(
         analysis=analysis,
@@ -50,7 +57,9 @@ def render_html(analysis: EpisodeAnalysis) -> str:
         charts=_charts(analysis.steps),
         slowest_ms=max((time.longest_ms for time in analysis.node_times), default=1.0),
         steps=[_StepPictures.of(step, outline_step(drawer, step, truth)) for step in analysis.steps],
-        scene=_path_scene(analysis),
+        scale=scale,
+        hypothesis_scale=_hypothesis_scale(analysis.steps),
+        scene=_path_scene(analysis, scale),
     )
 
 
@@ -116,7 +125,12 @@ def _chart(title: str, values: list[float], top: float, form: str) -> Chart:
     return Chart(title, points, ticks)
 
 
-def _path_scene(analysis: EpisodeAnalysis) -> dict:
+def _hypothesis_scale(steps: list[StepAnalysis]) -> ScoreScale:
+    known = [step.record.hypotheses.score for step in steps if step.record.hypotheses is not None]
+    return ScoreScale.around(np.concatenate([np.zeros(0), *known]))
+
+
+def _path_scene(analysis: EpisodeAnalysis, scale: ScoreScale) -> dict:
     """What the 3D drawing of the path needs, in metres: plain numbers, since it goes into the page as JSON."""
     last = analysis.steps[-1]
     return {
@@ -124,7 +138,7 @@ def _path_scene(analysis: EpisodeAnalysis) -> dict:
         "grid": analysis.sphere.positions.round(4).tolist(),
         "cameras": analysis.record.positions.round(4).tolist(),
         "objects": [
-            {"position": T[:3, 3].round(4).tolist(), "color": score_color(row.verification)}
+            {"position": T[:3, 3].round(4).tolist(), "color": scale.color(row.verification)}
             for T, row in zip(last.objects.T_world_object, last.rows, strict=True)
         ],
         "size": analysis.model.diameter,

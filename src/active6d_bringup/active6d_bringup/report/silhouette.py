@@ -40,7 +40,7 @@ class SilhouetteDrawer:
             covers sensor noise and small pose errors.
     """
 
-    def __init__(self, model: ObjectModel, depth_margin: float = 0.015) -> None:
+    def __init__(self, model: ObjectModel, depth_margin: float = 0.008) -> None:
         self._depth_margin = depth_margin
         self._radius = float(np.linalg.norm(model.mesh.vertices, axis=1).max())
         self._corners = np.array(np.meshgrid(*([[-1.0, 1.0]] * 3))).reshape(3, -1).T * self._radius
