@@ -1,6 +1,8 @@
 """How well and how fast estimators find objects in single views of stored scenes, and how much fusion adds."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -54,30 +56,20 @@ def measure_estimators(
     made = {name: create_estimator(name, model) for name in estimators}
     scenes = [load_scene(object_name, split, index) for index in range(SPLITS[split])]
     rng = np.random.default_rng(seed)
-    pairs = [(scene, view) for scene in range(len(scenes)) for view in range(len(ViewSphere()))]
+    grid = len(ViewSphere())
+    pairs = [(scene, view) for scene in range(len(scenes)) for view in range(grid)]
     if sample is not None and sample < len(pairs):
         pairs = [pairs[i] for i in sorted(rng.choice(len(pairs), sample, replace=False))]
-    walks = [
-        [(scene, int(view)) for view in rng.permutation(len(ViewSphere()))[: moves + 1]] for scene in range(len(scenes))
-    ]
+    walks = [[(scene, int(view)) for view in rng.permutation(grid)[: moves + 1]] for scene in range(len(scenes))]
     views = _Views(scenes, seed, noise)
     results = {}
     for name, estimator in made.items():
-        drawn = views.of(pairs, lambda done, what=name: on_progress(what, done, len(pairs)))
+        drawn = views.of(pairs, partial(on_progress, name))
         results[name] = summarise(model, evaluate_estimator(estimator, model, drawn))
         if moves:
-            walked = (
-                list(
-                    views.of(
-                        walk,
-                        lambda done, i=i: on_progress(
-                            f"{name}, fused", (moves + 1) * i + done, (moves + 1) * len(walks)
-                        ),
-                    )
-                )
-                for i, walk in enumerate(walks)
-            )
-            results[name]["fused"] = detection_over_views(estimator, model, walked).mean(axis=0).tolist()
+            walked = views.of([pair for walk in walks for pair in walk], partial(on_progress, f"{name}, fused"))
+            episodes = (list(islice(walked, moves + 1)) for _ in walks)
+            results[name]["fused"] = detection_over_views(estimator, model, episodes).mean(axis=0).tolist()
     return {
         "object": object_name,
         "split": split,
@@ -91,7 +83,7 @@ def measure_estimators(
 def summarise(model: ObjectModel, result: EstimatorResult) -> dict[str, Any]:
     """Rates by visible fraction, precision and time of one estimator.
 
-    ``precision`` counts ADD-S for an object with a part that can hide (the mug's handle): a view without it cannot tell.
+    ``precision`` counts ADD-S for an object with a part that can hide (the mug's handle): a view may not tell it.
     """
     by = "adds" if model.features else "add"
     precision = {kind: _mean(right) for kind, right in (("add", result.right_add), ("adds", result.right_adds))}
@@ -123,14 +115,14 @@ class _Views:
         self._noise = SensorNoise().scaled(noise)
         self._current: tuple[int, Simulator] | None = None
 
-    def of(self, pairs: Sequence[tuple[int, int]], on_view: Callable[[int], None]) -> Iterator[LabelledView]:
+    def of(self, pairs: Sequence[tuple[int, int]], on_view: Callable[[int, int], None]) -> Iterator[LabelledView]:
         """The views of (scene, view) pairs, one by one."""
         sphere = ViewSphere()
         for done, (index, number) in enumerate(pairs):
-            on_view(done)
+            on_view(done, len(pairs))
             if self._current is None or self._current[0] != index:
                 self._current = index, Simulator(self._scenes[index], noise=self._noise, seed=self._seed)
             scene = self._scenes[index]
             view = self._current[1].capture(sphere.pose(sphere.positions[number]), (number + 1) * 1_000_000_000)
             yield LabelledView(view, scene.T_world_object, scene.visible_fraction[number])
-        on_view(len(pairs))
+        on_view(len(pairs), len(pairs))

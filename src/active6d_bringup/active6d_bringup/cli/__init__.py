@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from active6d_bringup.cli import benchmark, doctor, episode, objects, replay, report
+from active6d_bringup.cli import benchmark, doctor, episode, objects, replay, report, scenes
 
 
 class CommandGroup(TyperGroup):
@@ -63,6 +63,7 @@ app.command()(episode.episode)
 app.command()(replay.replay)
 app.command()(report.report)
 app.add_typer(objects.app, name="object")
+app.add_typer(scenes.app, name="scenes")
 app.add_typer(benchmark.app, name="benchmark")
 
 
