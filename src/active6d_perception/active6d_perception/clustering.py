@@ -94,9 +94,10 @@ def suppress_neighbours(positions: np.ndarray, valid: np.ndarray, exclusion: flo
         (B, n) bool, which stay.
     """
     kept = valid.copy()
-    squared = ((positions[:, :, None] - positions[:, None]) ** 2).sum(axis=-1)
+    norm = (positions**2).sum(axis=-1)
+    squared = norm[:, :, None] + norm[:, None] - 2.0 * positions @ np.swapaxes(positions, 1, 2)
     close = (squared < exclusion**2) & np.tri(positions.shape[1], k=-1, dtype=bool)
     # Only what has a neighbour ahead can fall, and only in list order is it known which of those stay.
-    for index in np.flatnonzero((close & valid[:, None]).any(axis=(0, 2))):
+    for index in np.flatnonzero(close.any(axis=(0, 2))):
         kept[:, index] &= ~(close[:, index] & kept).any(axis=1)
     return kept

@@ -1,0 +1,133 @@
+"""Banks: what is written is read, an interrupted build goes on, and damaged files are refused in one line."""
+
+import functools
+import json
+
+import numpy as np
+import pytest
+from synthetic_bank import observe_synthetic, synthetic_bank, synthetic_scene
+
+from active6d_agent.bank import BankScene, build_bank, load_bank, observe_scene, view_entropy
+from active6d_core.camera import DEFAULT_CAMERA, View
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.metrics import e_add
+from active6d_core.object_model import load_object
+from active6d_core.se3 import invert
+from active6d_core.view_sphere import ViewSphere
+
+SPHERE = ViewSphere()
+
+
+def assert_equal(a: BankScene, b: BankScene):
+    assert a.name == b.name
+    for name in ("T_world_object", "view", "table", "errors", "entropy"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_a_bank_survives_the_disk(tmp_path):
+    bank = synthetic_bank("coffee_cup", scenes=3, objects=4)
+    bank.save(tmp_path / "bank.npz")
+    again = load_bank(tmp_path / "bank.npz")
+    assert (again.object_name, again.sphere, again.provenance) == ("coffee_cup", SPHERE, {"estimator": "synthetic"})
+    for a, b in zip(bank.scenes, again.scenes, strict=True):
+        assert_equal(a, b)
+
+
+def test_building_goes_on_where_it_stopped(tmp_path):
+    names, log, path = [f"mug/synthetic/{seed}" for seed in (4, 1, 2)], tmp_path / "log", tmp_path / "bank.npz"
+    observe = functools.partial(observe_synthetic, log=str(log))
+    progress = build_bank(path, "mug", names, observe, workers=1)
+    assert next(progress) in names
+    progress.close()
+    assert not path.exists()
+    assert sorted(build_bank(path, "mug", names, observe, workers=1, provenance={"seed": 1})) == sorted(names)
+    assert sorted(log.read_text().split()) == sorted(names), "no scene was looked at twice"
+    bank = load_bank(path)
+    assert [scene.name for scene in bank.scenes] == names
+    assert bank.provenance == {"seed": 1}
+    assert_equal(bank.scenes[1], synthetic_scene("mug", 1, 3, SPHERE))
+    assert list(tmp_path.glob("*.parts")) == []
+
+
+class PerfectEstimator:
+    """Reports every object of the scene, shifted by 2 mm along the optical axis."""
+
+    def __init__(self, T_world_object):
+        self.T_world_object = T_world_object
+
+    def estimate(self, view):
+        T = invert(view.T_world_camera) @ self.T_world_object
+        T[:, 2, 3] += 0.002
+        label = np.arange(1, len(T) + 1).astype(np.uint16)
+        segmentation = np.zeros((4, 6), np.uint16)
+        segmentation[0, : len(T)] = label
+        return Hypotheses.from_masks(T, np.full(len(T), 0.9), label, segmentation, np.full((4, 6), 0.7))
+
+
+class ConstantVerifier:
+    def score(self, depth, camera, hypotheses):
+        return np.full(len(hypotheses), 0.5)
+
+
+def test_observing_a_scene_pairs_hypotheses_with_the_truth():
+    model = load_object("mug")
+    truth = synthetic_scene("mug", 0, 3, SPHERE).T_world_object
+    stamps = []
+
+    def capture(T_world_camera, stamp):
+        stamps.append(stamp)
+        return View(stamp, np.zeros((4, 6, 3), np.uint8), np.full((4, 6), 0.7), DEFAULT_CAMERA, T_world_camera)
+
+    scene = observe_scene("mug/x/0", truth, capture, PerfectEstimator(truth), ConstantVerifier(), model, SPHERE)
+    assert stamps == [(i + 1) * 1_000_000_000 for i in range(100)]
+    np.testing.assert_array_equal(scene.view, np.repeat(np.arange(100), 3))
+    own = scene.errors[np.arange(300), np.tile(np.arange(3), 100)]
+    np.testing.assert_allclose(own, 0.002, atol=1e-6)
+    T = (
+        SPHERE.pose(SPHERE.positions[0])
+        @ PerfectEstimator(truth).estimate(capture(SPHERE.pose(SPHERE.positions[0]), 0)).T_camera_object
+    )
+    expected = e_add(model, T[0], truth)
+    np.testing.assert_allclose(scene.errors[0], np.where(expected < 0.05, expected, np.inf), atol=1e-6)
+    areas = np.array([21, 1, 1, 1]) / 24
+    np.testing.assert_allclose(scene.entropy, -(areas * np.log(areas)).sum())
+
+
+def test_entropy_of_even_and_of_empty_masks():
+    assert view_entropy(np.repeat(np.arange(4), 5).reshape(4, 5)) == pytest.approx(np.log(4))
+    assert view_entropy(np.zeros((3, 3), np.uint16)) == 0.0
+
+
+def damage_header(data):
+    data["header"] = np.array(json.dumps({**json.loads(str(data["header"])), "format": 99}))
+
+
+def cut_table(data):
+    data["table"] = data["table"][:-5]
+
+
+def poison_table(data):
+    data["table"][3, 3] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"), [(damage_header, "format 99"), (cut_table, "table"), (poison_table, "finite")]
+)
+def test_a_damaged_bank_is_refused_with_its_name(tmp_path, damage, message):
+    path = tmp_path / "bank.npz"
+    synthetic_bank("mug", scenes=1, objects=2).save(path)
+    data = dict(np.load(path))
+    damage(data)
+    np.savez(path, **data)
+    with pytest.raises(ValueError, match=message) as error:
+        load_bank(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"not a bank at all"])
+def test_what_is_no_bank_is_refused_with_its_name(tmp_path, content):
+    path = tmp_path / "bank.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"bank\.npz: not a scene bank"):
+        load_bank(path)
