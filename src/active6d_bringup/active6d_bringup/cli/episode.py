@@ -146,10 +146,10 @@ def _describe(step: "EpisodeStep", object_name: str) -> str:
     x, y, z = step.T_world_camera[:3, 3]
     azimuth, elevation = np.degrees([np.arctan2(y, x) % (2 * np.pi), np.arctan2(z, np.hypot(x, y))])
     score = _score(step, object_name)
-    found = f"   found {score.detected.sum()} of {len(score.detected)}" if score else ""
+    found = f"  found {score.detected.sum():2d}/{len(score.detected)}" if score else ""
     return (
-        f"view {step.index}   azimuth {azimuth:3.0f}°   elevation {elevation:2.0f}°   "
-        f"hypotheses {step.hypotheses:2d}   objects {len(step.objects):2d}{found}   {step.distance:.2f} m"
+        f"view {step.index:2d} at {azimuth:3.0f}° {elevation:2.0f}°  hypotheses {step.hypotheses:2d}  "
+        f"objects {len(step.objects):2d}{found}  {step.distance:5.2f} m"
     )
 
 

@@ -66,18 +66,17 @@ def print_summary(analysis: "EpisodeAnalysis") -> None:
     known = last.truth is not None
     title = "  ".join(part for part in (record.scene or analysis.model.name, record.policy) if part)
     table = Table(box=None, pad_edge=False, title=escape(title), title_justify="left", title_style="bold")
-    columns = ["view", "azimuth", "elevation", "moved m", "hypotheses", "objects", "attends to"]
-    for column in [*columns, *(["found", "e_ADD mm"] if known else [])]:
-        table.add_column(column, justify="right", header_style="dim")
+    columns = ["view", "camera", "moved", "hypotheses", "objects", "attends to"]
+    for column in [*columns, *(["found", "e_ADD"] if known else [])]:
+        table.add_column(column, justify="right", header_style="dim", no_wrap=True)
     for step in analysis.steps:
         truth = step.truth
         attended = f"#{step.attended.index} ({step.attended.verification:.2f})" if step.attended else "-"
-        scored = [f"{truth.detected.sum()}/{len(truth.detected)}", f"{truth.mean_e_add_mm:.1f}"] if truth else []
+        scored = [f"{truth.detected.sum()}/{len(truth.detected)}", f"{truth.mean_e_add_mm:.1f} mm"] if truth else []
         table.add_row(
             str(step.number),
-            f"{step.azimuth:.0f}°",
-            f"{step.elevation:.0f}°",
-            f"{step.moved_m:.2f}",
+            f"{step.azimuth:.0f}° {step.elevation:2.0f}°",
+            f"{step.moved_m:.2f} m",
             str(step.hypothesis_count),
             str(len(step.rows)),
             attended,

@@ -92,8 +92,8 @@ class _StepPictures:
 
 
 def _facts(analysis: EpisodeAnalysis) -> list[tuple[str, str]]:
-    """What the bag says of itself, and where it lies."""
-    shown = {"object", "scene"}
+    """What the bag says of itself and the page does not say elsewhere, and where it lies."""
+    shown = {"object", "scene", "policy", "moves", "metres"}
     facts = [(key.replace("_", " "), value) for key, value in analysis.record.info.items() if key not in shown]
     started = analysis.steps[0].record.stamp
     if started > 1e18:  # a real camera's clock; simulated time begins at one second
@@ -118,7 +118,7 @@ def _charts(steps: list[StepAnalysis]) -> list[Chart]:
 
 
 def _chart(title: str, values: list[float], top: float, form: str) -> Chart:
-    x = np.linspace(0, _CHART_WIDTH, len(values)) if len(values) > 1 else np.array([_CHART_WIDTH / 2])
+    x = np.linspace(16, _CHART_WIDTH - 8, len(values)) if len(values) > 1 else np.array([_CHART_WIDTH / 2])
     y = _CHART_HEIGHT * (1 - np.clip(np.array(values) / top, 0, 1))
     points = [(float(a), float(b), form.format(value)) for a, b, value in zip(x, y, values, strict=True)]
     ticks = [(_CHART_HEIGHT * (1 - share), f"{share * top:g}") for share in (0.0, 0.5, 1.0)]
