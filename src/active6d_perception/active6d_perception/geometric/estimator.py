@@ -99,8 +99,7 @@ class GeometricEstimator:
         score = _value(self._weigh(surface, poses, samples=512))
         # By the area that a pose explains, not by its share: a mug turned so that its handle would be hidden fits
         # perfectly, and leaves the handle that was measured unexplained.
-        tight = _value(self._weigh(surface, poses, samples=512, tolerance=0.003))
-        area = tight * self._views.visible.sum(axis=1)[self._views.nearest_direction(poses)]
+        area = score * self._views.visible.sum(axis=1)[self._views.nearest_direction(poses)]
         best = np.argsort(-area, kind="stable")
         best = best[score[best] >= self.parameters.min_score]
         label = claim_pixels(self._views, poses[best], surface.points, surface.foreground, view.camera)

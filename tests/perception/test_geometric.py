@@ -1,0 +1,113 @@
+"""The training-free estimator on simulated views with sensor noise, and the registry that finds it."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from active6d_core.camera import View
+from active6d_core.metrics import add_s, e_add
+from active6d_core.object_model import load_object
+from active6d_core.se3 import invert
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.estimator import create_estimator, list_estimators, register_estimator
+from active6d_perception.evaluation import LabelledView, detection_over_views, evaluate_estimator
+from active6d_perception.refinement import suppress
+from active6d_sim.heap import drop_heap
+from active6d_sim.simulator import Simulator
+
+SPHERE = ViewSphere()
+NAMES = ("coffee_cup", "bunny", "mug")
+
+
+def captures(model, views, **heap):
+    scene = drop_heap(model, **heap)
+    simulator = Simulator(scene, seed=0)
+    return [
+        LabelledView(
+            simulator.capture(SPHERE.pose(SPHERE.positions[view]), stamp),
+            scene.T_world_object,
+            scene.visible_fraction[view],
+        )
+        for stamp, view in enumerate(views, start=1)
+    ]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_finds_a_lone_object(name):
+    model = load_object(name)
+    # Without symmetry the mug needs its handle in the picture: ADD-S says that the body is found from anywhere.
+    error = add_s if name == "mug" else e_add
+    estimator = create_estimator("geometric", model)
+    for labelled in captures(model, (43, 67), seed=3, count=1):
+        view = labelled.view
+        found = estimator.estimate(view)
+        truth = invert(view.T_world_camera) @ labelled.T_world_object
+        best = found.score.argmax()
+        assert error(model, found.T_camera_object[best], truth[0]) < 0.1 * model.diameter
+        mask = found.segmentation == found.label[best]
+        assert np.nanmean(view.depth[mask]) == pytest.approx(found.depth[best])
+
+
+# Measured on 12 views of two heaps (docs/perception.md): .93, .72, .88 found and .96, .86, .99 right, by ADD-S.
+@pytest.mark.parametrize(("name", "found", "right"), [("coffee_cup", 0.6, 0.7), ("bunny", 0.4, 0.6), ("mug", 0.6, 0.7)])
+def test_finds_most_of_what_a_heap_shows(name, found, right):
+    model = load_object(name)
+    result = evaluate_estimator(create_estimator("geometric", model), model, captures(model, (45, 70), seed=11))
+    assert result.detection_rate(0.5, "adds") >= found
+    assert result.right_adds.mean() >= right
+    assert result.verification[result.right_adds].mean() > 0.5
+
+
+def test_is_deterministic_and_looks_at_depth_only():
+    model = load_object("bunny")
+    view = captures(model, (50,), seed=11)[0].view
+    elsewhere = View(view.stamp + 5, 255 - view.color, view.depth, view.camera, np.eye(4))
+    results = [create_estimator("geometric", model).estimate(seen) for seen in (view, elsewhere)]
+    for name in ("T_camera_object", "score", "box", "depth", "label", "segmentation"):
+        np.testing.assert_array_equal(getattr(results[0], name), getattr(results[1], name))
+
+
+@pytest.mark.parametrize("depth", [np.nan, 0.8])
+def test_nothing_to_see(depth):
+    model = load_object("mug")
+    view = captures(model, (50,), seed=3, count=1)[0].view
+    blank = View(1, view.color, np.full_like(view.depth, depth), view.camera, view.T_world_camera)
+    assert len(create_estimator("geometric", model).estimate(blank)) == 0
+
+
+def test_more_views_find_more():
+    model = load_object("coffee_cup")
+    rates = detection_over_views(create_estimator("geometric", model), model, [captures(model, (5, 52, 77), seed=11)])
+    assert rates.shape == (1, 3)
+    assert rates[0, -1] > rates[0, 0]
+
+
+def test_registry_names_what_it_knows():
+    model = load_object("mug")
+    assert "geometric" in list_estimators()
+    with pytest.raises(ValueError, match=r"unknown estimator 'psychic'; known: .*geometric"):
+        create_estimator("psychic", model)
+    with pytest.raises(ValueError, match=r"no parameter 'speed'; known: references, refined, min_score"):
+        create_estimator("geometric", model, speed=3)
+    with pytest.raises(ValueError, match="min_score must be in"):
+        create_estimator("geometric", model, min_score=2.0)
+    with pytest.raises(ValueError, match="registered already"):
+        create_estimator("geometric", model) and register_estimator("geometric")(lambda model: None)
+
+
+def test_the_geometric_estimator_needs_no_torch():
+    code = (
+        "import sys; from active6d_core.object_model import load_object;"
+        "from active6d_perception.estimator import create_estimator; create_estimator('geometric', load_object('mug'));"
+        "sys.exit('torch' in sys.modules or 'rclpy' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=100).returncode == 0
+
+
+def test_suppression_keeps_the_best_of_neighbours():
+    position = np.array([0.0, 1.0, 5.0, 5.5, 9.0])
+    distance = np.abs(position[:, None] - position)
+    kept = suppress(distance, np.array([0.5, 0.9, 0.3, 0.4, 0.1]), 2.0)
+    np.testing.assert_array_equal(kept, [1, 3, 4])
