@@ -1,5 +1,6 @@
 """What every node of the graph shares: lifecycle, checked parameters, guarded inputs, diagnostics, matching of stamps."""
 
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -257,6 +258,8 @@ def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> N
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     finally:
+        # A terminal and `ros2 launch` both interrupt their children: the second must not tear the clean-up.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
