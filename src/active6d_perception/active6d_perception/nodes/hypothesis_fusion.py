@@ -147,3 +147,7 @@ def export_mesh(model: ObjectModel) -> str:
 def main() -> None:
     """Entry point of ``ros2 run active6d_perception hypothesis_fusion``."""
     run_node(HypothesisFusionNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -99,3 +99,7 @@ class PoseEstimatorNode(GraphNode):
 def main() -> None:
     """Entry point of ``ros2 run active6d_perception pose_estimator``."""
     run_node(PoseEstimatorNode)
+
+
+if __name__ == "__main__":
+    main()
