@@ -16,7 +16,17 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     python_requires=">=3.11",
-    install_requires=["active6d_core", "active6d_perception", "gymnasium", "numpy", "pyyaml"],
+    install_requires=[
+        "active6d_core",
+        "active6d_perception",
+        "gymnasium",
+        "numpy",
+        "pyyaml",
+        "safetensors",
+        "scipy",
+        "stable-baselines3",
+        "torch",
+    ],
     entry_points={
         "console_scripts": [
             "attention_policy = active6d_agent.nodes.attention_policy:main",

@@ -18,7 +18,7 @@ ARGUMENTS = {
     "camera": ("simulator", ["simulator", "dataset", "none"], "what feeds the camera topics; none for a real driver"),
     "object": ("", None, "object that fills the bin; empty: as in params_file"),
     "seed": ("", None, "of the heap, the sensor's noise and the policy; empty: as in params_file"),
-    "scene": ("", None, "stored scene such as test/3 instead of a heap by seed; empty: as in params_file"),
+    "scene": ("", None, "stored scene such as mug/test/3 instead of a heap by seed; empty: as in params_file"),
     "estimator": ("", None, "which pose estimator; empty: as in params_file"),
     "policy": ("", None, "which policy chooses the views; empty: as in params_file"),
     "steps": ("", None, "moves in an episode; empty: as in params_file"),
@@ -45,7 +45,7 @@ TYPES = {"seed": int, "steps": int, "autostart": bool, "use_sim_time": bool}
 def _node(executable: str, given: dict[str, str], **process_options) -> Node:
     package, takes = NODES[executable]
     parameters = {
-        name: ParameterValue(given[name], value_type=TYPES.get(name, str))
+        name: ParameterValue(LaunchConfiguration(name), value_type=TYPES.get(name, str))
         for name in [*takes, "autostart", "use_sim_time"]
         if given[name]
     }
