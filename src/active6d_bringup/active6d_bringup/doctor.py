@@ -60,10 +60,18 @@ def _python() -> Check:
 
 
 def _libraries() -> Iterator[Check]:
-    for library, file, package in (("libusb", "usb-1.0", "libusb-1.0-0"), ("libGL", "GL", "libgl1")):
+    system = {
+        "usb-1.0": "libusb-1.0-0",
+        "GL": "libgl1",
+        "EGL": "libegl1",
+        "X11": "libx11-6",
+        "idn2": "libidn2-0",
+        "udev": "libudev1",
+    }
+    for file, package in system.items():
         found = ctypes.util.find_library(file)
         mend = "" if found else f"apt install {package} (as root); Open3D loads it"
-        yield Check("System libraries", library, bool(found), False, found or "not found", mend)
+        yield Check("System libraries", f"lib{file}", bool(found), False, found or "not found", mend)
     needed = {
         "numpy": "numpy",
         "scipy": "scipy",
@@ -71,8 +79,6 @@ def _libraries() -> Iterator[Check]:
         "pybullet": "pybullet",
         "open3d": "open3d",
         "rosbags": "rosbags",
-        "mcap": "mcap",
-        "zstandard": "zstandard",
         "jinja2": "jinja2",
         "matplotlib": "matplotlib",
         "PIL": "pillow",
@@ -84,6 +90,7 @@ def _libraries() -> Iterator[Check]:
         "safetensors": ("safetensors", "weights"),
         "gymnasium": ("gymnasium", "training policies"),
         "stable_baselines3": ("stable-baselines3", "training policies"),
+        "mcap": ("mcap", "a second reader of bags, for the tests; in requirements-dev.txt"),
     }
     for module, (distribution, purpose) in optional.items():
         yield _import_check("Python libraries", module, distribution, needed=False, mend=f"{PIP} ({purpose})")
