@@ -105,6 +105,7 @@ _registry: dict[str, Callable[..., Policy]] = {}
 # Where the project's own policies live, so that a baseline does not have to wait for torch.
 _MODULES = {
     "active6d_agent.baselines": ("random", "unidirectional", "max-distance", "lowest-score", "single-view", "entropy"),
+    "active6d_agent.attention": ("attention",),
 }
 
 

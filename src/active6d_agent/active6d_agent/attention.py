@@ -1,0 +1,171 @@
+"""The paper's policy: object attention (Algorithm 1) and a Gaussian over azimuth and elevation.
+
+``attention`` in the registry. Training is in :mod:`active6d_agent.train`; what it makes is a ``.safetensors`` file with
+a JSON of the configuration beside it, so loading weights executes nothing.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from active6d_agent.environment import MAX_OBJECTS
+from active6d_agent.policy import Decision, Observation, register_policy
+from active6d_core.object_model import ObjectModel
+
+#: What a state consists of beside the history: o_t (12) and the camera's position (3).
+_STATE = 15
+_FEATURES = 6
+SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
+
+
+class ObjectAttention(nn.Module):
+    """Algorithm 1: which object to reason about.
+
+    g^i = FC(b^i, d^i, c^i); w^i = Selector(g^i, mean g); the object with the highest softmax weight m is attended, and
+    o_t = (g^m times its weight, b^m, d^m, c^m). The choice is hard; gradients reach FC and Selector through g^m and
+    through the weight.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Sequential(nn.Linear(_FEATURES, _FEATURES), nn.ReLU())
+        self.selector = nn.Linear(2 * _FEATURES, 1)
+
+    def forward(self, objects: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Attend to one object of each scene.
+
+        Args:
+            objects: (B, N, 6) features, padded.
+            mask: (B, N) 1 for an object, 0 for padding.
+
+        Returns:
+            (B, 12) o_t, zeros without objects; (B, N) weights, zero for padding; (B,) index m, N - 1 without objects.
+        """
+        present = mask > 0
+        g = self.fc(objects)
+        count = present.sum(dim=1, keepdim=True).clamp(min=1)
+        pooled = (g * present[..., None]).sum(dim=1) / count
+        together = torch.cat([g, pooled[:, None].expand_as(g)], dim=-1)
+        score = self.selector(together)[..., 0].masked_fill(~present, -1e9)
+        weight = torch.softmax(score, dim=1) * present
+        index = weight.argmax(dim=1)
+        rows = torch.arange(len(objects), device=objects.device)
+        some = present.any(dim=1)
+        attended = torch.cat([g[rows, index] * weight[rows, index, None], objects[rows, index]], dim=1)
+        last = torch.full_like(index, objects.shape[1] - 1)
+        return attended * some[:, None], weight, torch.where(some, index, last)
+
+
+class AttentionNetwork(nn.Module):
+    """State (o_t, camera, history) to the mean of the Gaussian: one hidden layer of 128 units (supplement, E).
+
+    Args:
+        steps: horizon T that the history has room for.
+        hidden: units of the hidden layer.
+    """
+
+    def __init__(self, steps: int = 5, hidden: int = 128) -> None:
+        super().__init__()
+        self.steps, self.hidden = steps, hidden
+        self.attention = ObjectAttention()
+        self.policy = nn.Sequential(nn.Linear(_STATE + 3 * steps, hidden), nn.ReLU())
+        self.mean = nn.Linear(hidden, 2)
+        self.log_std = nn.Parameter(torch.full((2,), -0.5))
+
+    def state(self, observation: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(B, 15 + 3 T) state s_t, (B, N) attention weights and (B,) attended index."""
+        attended, weight, index = self.attention(observation["objects"], observation["mask"])
+        state = torch.cat([attended, observation["camera"], observation["history"].flatten(1)], dim=1)
+        return state, weight, index
+
+    def forward(self, observation: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(B, 2) mean azimuth and elevation in [-1, 1] units, attention weights, attended index."""
+        state, weight, index = self.state(observation)
+        return self.mean(self.policy(state)), weight, index
+
+
+def save_network(network: AttentionNetwork, path: Path, provenance: dict | None = None) -> None:
+    """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_file({name: value.contiguous() for name, value in network.state_dict().items()}, path)
+    config = {"policy": "attention", "steps": network.steps, "hidden": network.hidden, "provenance": provenance or {}}
+    path.with_suffix(".json").write_text(json.dumps(config, indent=2) + "\n")
+
+
+def load_network(path: Path) -> AttentionNetwork:
+    """Read what :func:`save_network` wrote.
+
+    Raises:
+        ValueError: a file is missing, damaged or does not fit; the message names it.
+    """
+    try:
+        config = json.loads(path.with_suffix(".json").read_text())
+        if config["policy"] != "attention":
+            raise ValueError(f"these are weights of policy '{config['policy']}'")
+        network = AttentionNetwork(int(config["steps"]), int(config["hidden"]))
+        network.load_state_dict(load_file(path))
+    except Exception as error:  # safetensors and torch raise their own kinds
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(
+            f"{path}: no weights of the attention policy ({reason}); see 'active6d train policy'"
+        ) from error
+    return network.eval()
+
+
+@register_policy("attention")
+class AttentionPolicy:
+    """The trained network, always at the mean of its Gaussian.
+
+    Args:
+        model: names the shipped weights.
+        weights: path of other weights, ``""`` for the shipped ones.
+
+    Raises:
+        ValueError: there are no usable weights.
+    """
+
+    def __init__(self, model: ObjectModel, weights: str = "") -> None:
+        self.network = load_network(
+            Path(weights) if weights else SHIPPED_WEIGHTS / f"attention_{model.name}.safetensors"
+        )
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """The mean is taken, so nothing is random here."""
+
+    def decide(self, observation: Observation) -> Decision:
+        """Attend to one object and go to the candidate nearest to the mean."""
+        candidates = observation.candidates()
+        if not candidates.any():
+            return Decision.stop_here(observation)
+        with torch.inference_mode():
+            mean, weight, index = self.network(encode(observation, self.network.steps))
+        count = min(len(observation.objects), MAX_OBJECTS)
+        attention = np.zeros(len(observation.objects))
+        attention[:count] = weight[0, :count].double().numpy()
+        azimuth, elevation = mean[0].double().clamp(-1.0, 1.0).tolist()
+        goal = observation.sphere.position(np.pi * azimuth, np.pi / 4 * (elevation + 1.0))
+        closeness = np.where(candidates, observation.sphere.positions @ goal, -np.inf)
+        attended = int(index[0]) if count else None
+        return Decision.go_to(observation, int(closeness.argmax()), attention / max(attention.sum(), 1e-12), attended)
+
+
+def encode(observation: Observation, steps: int) -> dict[str, torch.Tensor]:
+    """What :meth:`~active6d_agent.environment.Episodes.observe` gives, of one observation: a batch of one.
+
+    Args:
+        observation: of the policy.
+        steps: horizon T of the network; of a longer history the last T positions are kept.
+    """
+    unit = observation.positions / observation.sphere.radius
+    features = observation.objects.features()[:MAX_OBJECTS]
+    objects, mask = np.zeros((1, MAX_OBJECTS, _FEATURES), np.float32), np.zeros((1, MAX_OBJECTS), np.float32)
+    history = np.zeros((1, steps, 3), np.float32)
+    objects[0, : len(features)], mask[0, : len(features)] = features, 1.0
+    past = unit[:-1][-steps:]
+    history[0, : len(past)] = past
+    arrays = {"objects": objects, "mask": mask, "camera": unit[-1:].astype(np.float32), "history": history}
+    return {name: torch.from_numpy(values) for name, values in arrays.items()}

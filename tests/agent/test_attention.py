@@ -1,0 +1,222 @@
+"""Algorithm 1 against a loop over objects, the trained policy against its export, and weights that are damaged."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from synthetic_bank import synthetic_bank
+
+from active6d_agent.attention import (
+    AttentionNetwork,
+    AttentionPolicy,
+    ObjectAttention,
+    encode,
+    load_network,
+    save_network,
+)
+from active6d_agent.environment import Active6DEnv, Active6DVectorEnv, RewardParameters
+from active6d_agent.lookup import BankLookup
+from active6d_agent.policy import Observation, create_policy
+from active6d_agent.train import BankVecEnv, PaperPolicy, TrainingParameters, train_policy, validate
+
+
+@pytest.fixture(scope="module")
+def lookup():
+    return BankLookup(synthetic_bank("mug"))
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(0)
+    return AttentionNetwork().eval()
+
+
+def algorithm_1(module, features):
+    """The paper's loops, in numpy."""
+    tensors = {name: value.detach().double().numpy() for name, value in module.state_dict().items()}
+    g = [np.maximum(tensors["fc.0.weight"] @ f + tensors["fc.0.bias"], 0.0) for f in features]
+    g_global = sum(g) / len(g)
+    w = [
+        float(tensors["selector.weight"][0] @ np.concatenate([gi, g_global]) + tensors["selector.bias"][0]) for gi in g
+    ]
+    weights = np.exp(w) / np.exp(w).sum()
+    m = int(np.argmax(weights))
+    return np.concatenate([g[m] * weights[m], features[m]]), weights, m
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 20])
+def test_attention_is_algorithm_1(count):
+    torch.manual_seed(count)
+    module, rng = ObjectAttention(), np.random.default_rng(count)
+    padded = np.zeros((2, 20, 6), np.float32)
+    features = rng.random((2, count, 6)).astype(np.float32)
+    padded[:, :count] = features
+    mask = torch.arange(20).expand(2, 20) < count
+    attended, weight, index = module(torch.from_numpy(padded), mask.float())
+    for scene in range(2):
+        expected, weights, m = algorithm_1(module, features[scene].astype(float))
+        np.testing.assert_allclose(attended[scene].detach(), expected, atol=1e-5)
+        np.testing.assert_allclose(weight[scene, :count].detach(), weights, atol=1e-5)
+        assert index[scene] == m
+    assert not weight[:, count:].any()
+
+
+def test_sizes_are_the_papers():
+    """Supplement E: the Selector maps 12 to 1, the policy network has 128 units; NOTES: 12 + 3 + 3 T numbers."""
+    network = AttentionNetwork(steps=5)
+    assert network.attention.selector.weight.shape == (1, 12)
+    assert network.attention.fc[0].weight.shape == (6, 6)
+    assert network.policy[0].weight.shape == (128, 12 + 3 + 15)
+    assert network.mean.weight.shape == (2, 128)
+
+
+def test_what_is_padding_does_not_matter():
+    torch.manual_seed(1)
+    module, objects = ObjectAttention(), torch.rand(1, 9, 6)
+    mask = (torch.arange(9) < 4).float()[None]
+    noisy = objects.clone()
+    noisy[:, 4:] = 100.0
+    for a, b in zip(module(objects, mask), module(noisy, mask), strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_order_of_objects_does_not_matter():
+    torch.manual_seed(2)
+    module, objects = ObjectAttention(), torch.rand(1, 6, 6)
+    order = torch.tensor([3, 0, 5, 1, 4, 2])
+    mask = torch.ones(1, 6)
+    attended, weight, index = module(objects, mask)
+    shuffled = module(objects[:, order], mask)
+    torch.testing.assert_close(attended, shuffled[0])
+    torch.testing.assert_close(weight[:, order], shuffled[1])
+    assert order[shuffled[2]] == index
+
+
+def test_without_objects_nothing_is_attended():
+    attended, weight, index = ObjectAttention()(torch.rand(1, 5, 6), torch.zeros(1, 5))
+    assert not attended.any()
+    assert not weight.any()
+    assert index == 4
+
+
+def test_gradients_flow_from_the_policy_through_the_weight(network):
+    torch.manual_seed(3)
+    observation = {
+        "objects": torch.rand(4, 8, 6),
+        "mask": torch.ones(4, 8),
+        "camera": torch.rand(4, 3),
+        "history": torch.zeros(4, 5, 3),
+    }
+    network(observation)[0].sum().backward()
+    for name, parameter in network.attention.named_parameters():
+        if name != "selector.bias":  # one constant added to all scores leaves their softmax as it is
+            assert parameter.grad.abs().sum() > 0, name
+
+
+def test_the_deployed_policy_sees_what_the_environment_shows(lookup, network, tmp_path):
+    """Node and environment choose the same view from the same observation, attending to the same object."""
+    save_network(network, tmp_path / "weights.safetensors")
+    policy = AttentionPolicy(lookup.model, str(tmp_path / "weights.safetensors"))
+    policy.reset(np.random.default_rng(0))
+    for scene in range(2):
+        env = Active6DEnv(lookup)
+        observation, info = env.reset(seed=0, options={"scene": scene, "view": 33})
+        views = [info["view"]]
+        for _ in range(5):
+            seen = Observation(
+                lookup.objects(scene, views),
+                lookup.sphere.positions[views],
+                lookup.sphere,
+                np.ones(100, bool),
+                6 - len(views),
+            )
+            for name, values in encode(seen, 5).items():
+                np.testing.assert_allclose(values[0], observation[name], atol=1e-6, err_msg=name)
+            decision = policy.decide(seen)
+            batch = {name: torch.from_numpy(values[None]) for name, values in observation.items()}
+            with torch.inference_mode():
+                mean, _, index = network(batch)
+            assert decision.attended == int(index[0])
+            assert decision.attention.argmax() == decision.attended
+            assert decision.attention.sum() == pytest.approx(1.0)
+            observation, _, _, _, info = env.step(np.append(mean[0].clamp(-1, 1).numpy(), index[0]))
+            views.append(info["view"])
+            assert decision.view == info["view"]
+
+
+def test_the_export_is_the_trained_policy(lookup):
+    environment = BankVecEnv(Active6DVectorEnv(lookup, 6))
+    environment.seed(0)
+    torch.manual_seed(4)
+    policy = PaperPolicy(environment.observation_space, environment.action_space, lambda _: 1e-4)
+    network, observation = policy.network(), environment.reset()
+    actions, _ = policy.predict(observation, deterministic=True)
+    with torch.inference_mode():
+        mean, _, index = network({name: torch.from_numpy(values) for name, values in observation.items()})
+    np.testing.assert_allclose(actions[:, :2], mean.clamp(-1, 1), atol=1e-6)
+    np.testing.assert_array_equal(actions[:, 2], index)
+    tensors = {name: torch.from_numpy(values) for name, values in observation.items()}
+    sampled, values, log_prob = policy.forward(tensors)
+    again = policy.evaluate_actions(tensors, sampled)
+    torch.testing.assert_close(again[0], values)
+    torch.testing.assert_close(again[1], log_prob)
+
+
+def test_training_is_its_seed_learns_and_resumes(lookup, tmp_path):
+    settings = {"environments": 8, "rollout": 5, "batch": 20, "evaluate_every": 40, "seed": 3}
+    curves = []
+    for name in ("a", "b"):
+        parameters = TrainingParameters(total=80, **settings)
+        curves.append(list(train_policy(lookup, lookup, tmp_path / name, parameters)))
+    assert [(p.steps, p.detection_rate, p.e_add_mm, p.mean_return) for p in curves[0]] == [
+        (p.steps, p.detection_rate, p.e_add_mm, p.mean_return) for p in curves[1]
+    ]
+    longer = TrainingParameters(total=120, **settings)
+    later = list(train_policy(lookup, lookup, tmp_path / "a", longer, resume=True))
+    assert [p.steps for p in later] == [120]
+    assert len((tmp_path / "a" / "curve.jsonl").read_text().splitlines()) == 3
+    best = max(
+        (json.loads(line) for line in (tmp_path / "a" / "curve.jsonl").open()), key=lambda p: p["detection_rate"]
+    )
+    network = load_network(tmp_path / "a" / "best.safetensors")
+    assert validate(network, lookup, 5)[0] == pytest.approx(best["detection_rate"])
+    with pytest.raises(ValueError, match="other parameters"):
+        list(train_policy(lookup, lookup, tmp_path / "a", TrainingParameters(total=9, gamma=0.5), resume=True))
+    with pytest.raises(ValueError, match="nothing to resume from"):
+        list(train_policy(lookup, lookup, tmp_path / "c", longer, resume=True))
+
+
+def test_training_learns_what_is_rewarded(lookup, tmp_path):
+    """With a penalty on motion alone, the policy must come to stay near."""
+    reward = RewardParameters(alpha=0.0, beta=0.0, error_scale=0.0, motion_scale=1.0)
+    parameters = TrainingParameters(
+        total=12_800, environments=64, rollout=10, evaluate_every=1_280, learning_rate=3e-3, batch=128
+    )
+    curve = list(train_policy(lookup, lookup, tmp_path, parameters, reward))
+    assert curve[-1].mean_return > 0.7 * curve[0].mean_return, "the returns are negative"
+    assert curve[-1].distance_m < 0.7 * curve[0].distance_m
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("weights.safetensors", lambda path: path.write_bytes(b"no tensors"), "no weights of the attention policy"),
+        ("weights.safetensors", lambda path: path.unlink(), "no weights of the attention policy"),
+        ("weights.json", lambda path: path.unlink(), "no weights of the attention policy"),
+        ("weights.json", lambda path: path.write_text("{}"), "policy"),
+        ("weights.json", lambda path: path.write_text('{"policy": "other"}'), "weights of policy 'other'"),
+        (
+            "weights.json",
+            lambda path: path.write_text('{"policy": "attention", "steps": 9, "hidden": 128}'),
+            "state_dict",
+        ),
+    ],
+)
+def test_damaged_weights_are_refused_in_one_line(network, model, tmp_path, name, damage, message):
+    save_network(network, tmp_path / "weights.safetensors")
+    damage(tmp_path / name)
+    with pytest.raises(ValueError, match=message) as error:
+        create_policy("attention", model, weights=str(tmp_path / "weights.safetensors"))
+    assert "\n" not in str(error.value)
+    assert "weights.safetensors" in str(error.value)
