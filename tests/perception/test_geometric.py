@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -21,8 +22,13 @@ SPHERE = ViewSphere()
 NAMES = ("coffee_cup", "bunny", "mug")
 
 
-def captures(model, views, **heap):
-    scene = drop_heap(model, **heap)
+@lru_cache
+def dropped(model, seed, count):
+    return drop_heap(model, seed, count=count)
+
+
+def captures(model, views, seed, count=None):
+    scene = dropped(model, seed, count)
     simulator = Simulator(scene, seed=0)
     return [
         LabelledView(

@@ -48,6 +48,8 @@ class Verifier:
                 raise ValueError(f"verification: {name} must be positive, got {value}")
         self.epsilon, self.samples, self.reach = epsilon, samples, reach
         self.views: ModelViews = model_views(model)
+        for direction in range(len(self.views.directions)):
+            self.views.visible_tree(direction)  # now, so that no view waits for it later
 
     def score(self, depth: np.ndarray, camera: PinholeCamera, hypotheses: Hypotheses) -> np.ndarray:
         """Verification scores c of all hypotheses of a view.
