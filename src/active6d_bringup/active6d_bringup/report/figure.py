@@ -37,7 +37,7 @@ def render_png(analysis: EpisodeAnalysis) -> bytes:
         _draw_course(figure.add_axes((0.755, 0.095, 0.21, 0.32)), analysis.steps)
         _draw_title(figure, analysis, scale)
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png")
+        figure.savefig(buffer, format="png", pil_kwargs={"optimize": True})
     return buffer.getvalue()
 
 
