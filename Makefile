@@ -20,7 +20,7 @@ test: setup  ## all tests
 	$(BIN)/python -m pytest tests
 
 lint: setup  ## ruff on all Python files
-	$(BIN)/ruff check src tests
+	$(BIN)/ruff check src tests scripts
 
 clean:  ## remove .venv, builds and recorded bags
 	rm -rf .venv ros2_ws/{build,install,log} bags/* src/*/*.egg-info src/*/build .pytest_cache .ruff_cache .hypothesis
