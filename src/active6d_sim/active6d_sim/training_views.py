@@ -1,27 +1,30 @@
 """Views with ground truth to learn a pose estimator from: random heaps, bins, looks, cameras and sensor noise.
 
-Nothing here is a stored scene: heaps are dropped from their own range of seeds, which :func:`training_heap` checks
-against the seeds of every stored scene.
+Test scenes are never learned from: heaps to learn from are dropped from their own range of seeds, which
+:func:`training_heap` insists on.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from active6d_core.camera import PinholeCamera, View
-from active6d_core.object_model import ObjectModel
+from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View
+from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import invert, look_at, make_transform
+from active6d_core.view_sphere import ViewSphere
 from active6d_sim.appearance import Appearance
 from active6d_sim.heap import drop_heap
 from active6d_sim.renderer import RenderedView, SceneRenderer
 from active6d_sim.scene import Bin, Scene
-from active6d_sim.scene_store import SPLITS, load_scene
+from active6d_sim.scene_store import load_scene
 from active6d_sim.sensor import SensorNoise, apply
 
-#: Heaps to learn from are dropped from seeds at or above this one; stored scenes and episodes use smaller ones.
+#: Heaps to learn from are dropped from seeds from here on; those of stored scenes and of episodes are smaller.
 FIRST_SEED = 1_000_000
+
+_VIEWS_PER_LOOK = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +45,13 @@ class TrainingView:
 
 
 def training_heap(model: ObjectModel, seed: int) -> Scene:
-    """Drop a random heap: from a single object to the model's usual number and a few more, in a bin with or without walls.
+    """Drop a random heap: a single object up to a few more than usual, in a bin with or without walls.
 
     Raises:
-        ValueError: ``seed`` is below :data:`FIRST_SEED`, or a stored scene has it.
+        ValueError: ``seed`` is below :data:`FIRST_SEED`.
     """
     if seed < FIRST_SEED:
-        raise ValueError(f"heaps to learn from need a seed of at least {FIRST_SEED}, got {seed}")
-    if seed in stored_seeds(model):
-        raise ValueError(f"seed {seed} belongs to a stored scene of {model.name}")
+        raise ValueError(f"heaps to learn from need seeds from {FIRST_SEED} on, got {seed}: others are for evaluation")
     rng = np.random.default_rng([seed, 1])
     most = model.instances[1]
     count = int(rng.integers(model.instances[0], most + 3) if rng.random() < 0.7 else rng.integers(1, most))
@@ -58,18 +59,6 @@ def training_heap(model: ObjectModel, seed: int) -> Scene:
     width, depth = usual.inner_width * rng.uniform(0.85, 1.25, 2)
     height = 0.0 if rng.random() < 0.25 else usual.wall_height * rng.uniform(0.3, 1.5)
     return drop_heap(model, seed, count=count, bin=Bin(width, depth, height), name=f"{model.name}/training/{seed}")
-
-
-def stored_seeds(model: ObjectModel) -> frozenset[int]:
-    """Seeds of all stored scenes of an object; empty for an object that has none."""
-    seeds = set()
-    for split, count in SPLITS.items():
-        for index in range(count):
-            try:
-                seeds.add(load_scene(model.name, split, index).seed)
-            except ValueError:
-                break
-    return frozenset(seeds)
 
 
 def random_camera(rng: np.random.Generator, width: int = 640, height: int = 480) -> tuple[PinholeCamera, np.ndarray]:
@@ -86,26 +75,50 @@ def random_camera(rng: np.random.Generator, width: int = 640, height: int = 480)
 
 
 def training_views(
-    scene: Scene, model: ObjectModel, count: int, rng: np.random.Generator, *, truth_scale: float = 0.25, threads: int = 0
+    scene: Scene,
+    model: ObjectModel,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    truth_scale: float = 0.25,
+    threads: int = 0,
 ) -> Iterator[TrainingView]:
-    """``count`` views of a heap, each pair of them with another look, camera and strength of noise (up to doubled)."""
-    renderer = None
+    """``count`` views of a heap: random cameras, noise up to doubled, and another look every few views.
+
+    Args:
+        scene: from :func:`training_heap`.
+        model: its object.
+        count: of views.
+        rng: source of randomness.
+        truth_scale: resolution of the truth, relative to the view's.
+        threads: for ray casting, 0 for all cores.
+    """
     for index in range(count):
-        if index % 4 == 0:
+        if index % _VIEWS_PER_LOOK == 0:
             renderer = SceneRenderer(scene, model=model, appearance=Appearance.random(rng), threads=threads)
         camera, T_world_camera = random_camera(rng)
-        yield training_view(renderer, camera, T_world_camera, SensorNoise().scaled(rng.uniform(0, 2)), rng, truth_scale)
+        yield _capture(renderer, camera, T_world_camera, SensorNoise().scaled(rng.uniform(0, 2)), rng, truth_scale)
 
 
-def training_view(
+def validation_views(
+    object_name: str, index: int, *, count: int = 12, truth_scale: float = 0.25, threads: int = 0
+) -> Iterator[TrainingView]:
+    """``count`` views of the grid of one stored scene of the validation split, as the simulator shows them."""
+    scene = load_scene(object_name, "val", index)
+    renderer = SceneRenderer(scene, model=load_object(object_name), appearance_seed=scene.seed, threads=threads)
+    rng, sphere = np.random.default_rng(scene.seed), ViewSphere()
+    for view in rng.choice(len(sphere), count, replace=False):
+        yield _capture(renderer, DEFAULT_CAMERA, sphere.pose(sphere.positions[view]), SensorNoise(), rng, truth_scale)
+
+
+def _capture(
     renderer: SceneRenderer,
     camera: PinholeCamera,
     T_world_camera: np.ndarray,
     noise: SensorNoise,
     rng: np.random.Generator,
-    truth_scale: float = 0.25,
+    truth_scale: float,
 ) -> TrainingView:
-    """Render one view, as the sensor sees it and as it is."""
     rendered = renderer.render(T_world_camera, camera)
     color, depth = apply(rendered, camera, noise, rng)
     coarse = camera.scaled(truth_scale)

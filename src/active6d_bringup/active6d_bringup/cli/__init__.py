@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from active6d_bringup.cli import benchmark, doctor, episode, objects, replay, report, scenes
+from active6d_bringup.cli import benchmark, doctor, episode, objects, replay, report, scenes, train
 
 
 class CommandGroup(TyperGroup):
@@ -65,6 +65,7 @@ app.command()(report.report)
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
 app.add_typer(benchmark.app, name="benchmark")
+app.add_typer(train.app, name="train")
 
 
 def main() -> None:

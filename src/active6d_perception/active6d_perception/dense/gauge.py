@@ -53,7 +53,7 @@ class Gauge:
     group: np.ndarray
 
     def axis_pose(self, T_camera_object: np.ndarray) -> np.ndarray:
-        """(n, 4, 4) ``T_camera_axis`` of (n, 4, 4) poses; among poses that a finite group makes equal, always the same one."""
+        """(n, 4, 4) ``T_camera_axis`` of (n, 4, 4) poses; of those that the group makes equal, always the same."""
         equals = T_camera_object[:, None] @ make_transform(self.group, np.zeros(3))
         eye = -np.einsum("nsji,nsj->nsi", equals[..., :3, :3], equals[..., :3, 3])
         chosen = (eye @ _REFERENCE).argmax(axis=1)
@@ -112,7 +112,9 @@ def _axis_frame_beside(model: ObjectModel, feature: str) -> np.ndarray | None:
             centre = in_plane @ offset
             return tree.query((body - centre) @ np.swapaxes(turns, 1, 2) + centre)[0]
 
-        found = minimize(lambda offset: np.minimum(distances(offset), 4 * tolerance).mean(), body.mean(axis=0), method="Nelder-Mead")
+        found = minimize(
+            lambda offset: np.minimum(distances(offset), 4 * tolerance).mean(), body.mean(axis=0), method="Nelder-Mead"
+        )
         if (distances(found.x) < tolerance).mean() >= _BODY_SHARE:
             origin = in_plane @ found.x
             x = in_plane @ (points[part].mean(axis=0) - origin)

@@ -12,7 +12,7 @@ DIRECTION_BINS = 64
 #: Name and channels of each part of the answer, in the order they come.
 HEADS = {
     "mask": 1,  # logit: an object or not
-    "centre": 3,  # from the pixel's surface point to the axis frame's origin, in the frame of the pixel's ray, diameters
+    "centre": 3,  # from the surface point to the axis frame's origin, in the frame of the pixel's ray, diameters
     "centre_scale": 1,  # logarithm of the Laplace scale of its error
     "coordinates": 3,  # the surface point in the canonical frame, diameters
     "coordinates_scale": 1,  # logarithm of the Laplace scale of its error
@@ -30,7 +30,9 @@ class NetworkSize:
 
     def __post_init__(self) -> None:
         if len(self.widths) != 4 or min(*self.widths, self.last) < 1:
-            raise ValueError(f"a network needs four positive widths and a positive last width, got {self.widths}, {self.last}")
+            raise ValueError(
+                f"a network needs four positive widths and a positive last width, got {self.widths}, {self.last}"
+            )
 
 
 class DenseNetwork(nn.Module):

@@ -46,7 +46,7 @@ def reduction(camera: PinholeCamera) -> int:
 
 
 def reduce_view(view: View) -> ReducedView:
-    """Reduce a view to the network's resolution; what a whole factor does not divide is cut off at the right and bottom."""
+    """Reduce a view to the network's resolution; what the factor does not divide is cut off at the right and bottom."""
     factor = reduction(view.camera)
     height, width = (size // factor for size in view.depth.shape)
     blocks = view.color[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
@@ -116,6 +116,13 @@ def pad(tensor: np.ndarray) -> np.ndarray:
     return np.pad(tensor, ((0, 0), (0, -height % MULTIPLE), (0, -width % MULTIPLE)))
 
 
+def output_camera(input_camera: PinholeCamera) -> PinholeCamera:
+    """Intrinsics of the network's answer, from those of its input; a side that the stride does not divide is cut."""
+    exact = input_camera.scaled(1 / OUTPUT_STRIDE)
+    width, height = input_camera.width // OUTPUT_STRIDE, input_camera.height // OUTPUT_STRIDE
+    return PinholeCamera(width, height, exact.fx, exact.fy, exact.cx, exact.cy)
+
+
 @lru_cache(maxsize=8)
 def ray_frames(camera: PinholeCamera) -> np.ndarray:
     """(h, w, 3, 3) ``R_camera_ray`` of every pixel: :func:`ray_rotation` of its ray. Read-only."""
@@ -125,7 +132,7 @@ def ray_frames(camera: PinholeCamera) -> np.ndarray:
 
 
 def ray_rotation(direction: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) float32 rotations that turn the optical axis to (..., 3) directions the short way, about no other axis."""
+    """(..., 3, 3) float32 rotations that turn the optical axis to (..., 3) directions the short way."""
     x, y, w = np.moveaxis(direction / np.linalg.norm(direction, axis=-1, keepdims=True), -1, 0)
     share = 1 / (1 + w)
     rows = [[1 - x * x * share, -x * y * share, x], [-x * y * share, 1 - y * y * share, y], [-x, -y, w]]

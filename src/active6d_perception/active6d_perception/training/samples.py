@@ -32,7 +32,11 @@ class Sample:
 
 
 def make_sample(
-    view: View, surface_depth: np.ndarray, instance: np.ndarray, T_camera_object: np.ndarray, visible_fraction: np.ndarray
+    view: View,
+    surface_depth: np.ndarray,
+    instance: np.ndarray,
+    T_camera_object: np.ndarray,
+    visible_fraction: np.ndarray,
 ) -> Sample:
     """Reduce a view and check that the truth, which comes at the network's output resolution, fits to it.
 
@@ -42,7 +46,9 @@ def make_sample(
     reduced = reduce_view(view)
     expected = tuple(size // OUTPUT_STRIDE for size in reduced.depth.shape)
     if surface_depth.shape != expected or instance.shape != expected:
-        raise ValueError(f"the truth of a training view must be {expected}, got {surface_depth.shape} and {instance.shape}")
+        raise ValueError(
+            f"the truth of a training view must be {expected}, got {surface_depth.shape} and {instance.shape}"
+        )
     return Sample(reduced, surface_depth, instance, T_camera_object, visible_fraction)
 
 

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from active6d_core.camera import PinholeCamera, pixel_rays
+from active6d_core.camera import pixel_rays
 from active6d_core.se3 import invert
 from active6d_perception.dense.gauge import Gauge, Turn
 from active6d_perception.dense.network import DIRECTION_BINS
-from active6d_perception.dense.network_input import OUTPUT_STRIDE, ray_frames, ray_rotation
+from active6d_perception.dense.network_input import output_camera, ray_frames, ray_rotation
 from active6d_perception.dense.sphere_bins import kernel
 from active6d_perception.training.samples import Sample
 
@@ -69,10 +69,3 @@ def make_targets(sample: Sample, gauge: Gauge, diameter: float) -> Targets:
         axis=np.einsum("nij,nj->ni", R_ray_camera, T_axis[:, :3, 2]).astype(np.float32)[instance],
         direction=direction[instance],
     )
-
-
-def output_camera(input_camera: PinholeCamera) -> PinholeCamera:
-    """Intrinsics of the network's answer, from those of its input; a side that the stride does not divide is cut."""
-    exact = input_camera.scaled(1 / OUTPUT_STRIDE)
-    width, height = input_camera.width // OUTPUT_STRIDE, input_camera.height // OUTPUT_STRIDE
-    return PinholeCamera(width, height, exact.fx, exact.fy, exact.cx, exact.cy)

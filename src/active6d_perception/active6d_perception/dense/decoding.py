@@ -1,0 +1,166 @@
+"""From the network's answer to poses: instances from votes, a robust rigid fit for each, the turn about the axis."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit, log_softmax, softmax
+
+from active6d_core.camera import PinholeCamera, pixel_rays
+from active6d_core.se3 import make_transform
+from active6d_perception.dense.gauge import Gauge, Turn, turn_about_z
+from active6d_perception.dense.network import split
+from active6d_perception.dense.network_input import ray_frames, ray_rotation
+from active6d_perception.dense.rigid_fit import robust_fit
+from active6d_perception.dense.sphere_bins import density
+from active6d_perception.dense.votes import cluster_votes
+
+#: Turns about the axis at which the distribution of a turn is evaluated.
+TURNS = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+
+
+@dataclass(frozen=True)
+class DecodingParameters:
+    """Thresholds of decoding; lengths in diameters.
+
+    Attributes:
+        mask_threshold: probability above which a pixel belongs to an object.
+        pixels: most pixels per instance that take part in the fit.
+        fewest_pixels: an instance with fewer is dropped.
+        tolerance: residual of a correspondence that counts half.
+        coordinates: fit object coordinates to points; without it, poses come from the votes for centre and axis alone.
+    """
+
+    mask_threshold: float = 0.5
+    pixels: int = 160
+    fewest_pixels: int = 12
+    tolerance: float = 0.05
+    coordinates: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Instances:
+    """n instances that the network's answer shows, p pixels in all.
+
+    Attributes:
+        pixel: (p,) flat indices into the answer's image.
+        label: (p,) index of each pixel's instance.
+        T_camera_axis: (n, 4, 4) pose of the axis frame, at turn 0 where the turn is not told by coordinates.
+        agreement: (n,) share of the correspondences that agree with the pose, in [0, 1].
+        confidence: (n,) mean probability of the instance's pixels.
+        turn: (n, len(TURNS)) how likely each turn about the axis is, on top of ``T_camera_axis``; rows sum to 1.
+    """
+
+    pixel: np.ndarray
+    label: np.ndarray
+    T_camera_axis: np.ndarray
+    agreement: np.ndarray
+    confidence: np.ndarray
+    turn: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.T_camera_axis)
+
+
+def decode(
+    answer: np.ndarray,
+    depth: np.ndarray,
+    camera: PinholeCamera,
+    gauge: Gauge,
+    diameter: float,
+    parameters: DecodingParameters = DecodingParameters(),
+) -> Instances:
+    """Instances and their poses.
+
+    Args:
+        answer: (channels, h, w) of the network.
+        depth: (h, w) metres at that resolution, NaN where invalid.
+        camera: intrinsics of both.
+        gauge: that the network was trained with.
+        diameter: of the object, metres.
+        parameters: thresholds.
+    """
+    probability = expit(answer[0])
+    pixel = np.flatnonzero((probability > parameters.mask_threshold) & np.isfinite(depth))
+    parts = split(answer.reshape(len(answer), -1).T[pixel])
+    points = pixel_rays(camera).reshape(-1, 3)[pixel] * depth.ravel()[pixel, None]
+    votes = points + diameter * np.einsum("pij,pj->pi", ray_frames(camera).reshape(-1, 3, 3)[pixel], parts["centre"])
+    weight = np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))
+    clusters = cluster_votes(votes, weight, diameter, parameters.fewest_pixels)
+    member = clusters.label >= 0
+    label, pixel, points = clusters.label[member], pixel[member], points[member]
+    parts = {name: part[member] for name, part in parts.items()}
+    count = len(clusters.centre)
+    table, used = _member_table(label, count, parameters.pixels)
+    R_camera_ray = ray_rotation(clusters.centre)
+    directions = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
+    T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
+    agreement = np.ones(count)
+    if gauge.turn is Turn.VISIBLE:
+        # The best turn of the axis votes' pose makes it a candidate for the fit.
+        T = T @ turn_about_z(TURNS[_turn_probability(T, R_camera_ray, directions).argmax(axis=1)])
+    if count and parameters.coordinates:
+        trust = used * np.exp(-np.clip(parts["coordinates_scale"][:, 0], -4.0, 0.0))[table]
+        T, agreement = robust_fit(
+            parts["coordinates"][table].astype(float) * diameter,
+            points[table].astype(float),
+            trust.astype(float),
+            parameters.tolerance * diameter,
+            np.random.default_rng(0),
+            T[:, None] if gauge.turn is Turn.VISIBLE else T[:, None, :, :][:, :0],
+        )
+    turn = np.zeros((count, len(TURNS)))
+    turn[:, 0] = 1.0
+    if gauge.turn is Turn.TOLD_BY_FEATURE:
+        turn = _turn_probability(T, R_camera_ray, directions)
+    confidence = _mean(probability.ravel()[pixel][:, None], label, count)[:, 0]
+    return Instances(pixel, label, T, agreement, confidence, turn)
+
+
+def _turn_probability(T_camera_axis: np.ndarray, R_camera_ray: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """(n, len(TURNS)) probability of each turn, from (n, DIRECTION_BINS) distributions of the frame's x direction."""
+    x = (T_camera_axis[:, None] @ turn_about_z(TURNS))[..., :3, 0]
+    return density(directions, np.einsum("nij,nti->ntj", R_camera_ray, x))
+
+
+def _poses_from_axes(
+    parts: dict, table: np.ndarray, used: np.ndarray, votes: np.ndarray, R_camera_ray: np.ndarray
+) -> np.ndarray:
+    """(n, 4, 4) poses from the votes for centre and axis alone, at an arbitrary turn: robust means of both."""
+    centre = _robust_mean(votes[table], used * np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))[table], 0.01)
+    axis = _robust_mean(parts["axis"][table].astype(float), used.astype(float), 0.2)
+    z = np.einsum("nij,nj->ni", R_camera_ray, axis)
+    z /= np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-9)
+    across = np.where(np.abs(z[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    x = across - z * (across * z).sum(axis=1, keepdims=True)
+    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+    return make_transform(np.stack([x, np.cross(z, x), z], axis=-1), centre)
+
+
+def _robust_mean(values: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
+    """(n, 3) reweighted means of (n, p, 3) values; one ``scale`` off the mean counts a quarter."""
+    trust = weight
+    for _ in range(5):
+        mean = np.einsum("np,npi->ni", trust, values) / np.maximum(trust.sum(axis=1, keepdims=True), 1e-12)
+        trust = weight / (1 + ((values - mean[:, None]) ** 2).sum(axis=-1) / scale**2) ** 2
+    return mean
+
+
+def _member_table(label: np.ndarray, count: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """(count, most) positions of at most that many members of each label, evenly taken, and which entries are used."""
+    order = np.argsort(label, kind="stable")
+    size = np.bincount(label, minlength=count)
+    start = np.cumsum(size) - size
+    taken = np.minimum(size, most)
+    column = np.arange(most)
+    rank = column * size[:, None] // np.maximum(taken, 1)[:, None]
+    used = column < taken[:, None]
+    return order[np.where(used, start[:, None] + rank, start[:, None])] if count else np.zeros((0, most), int), used
+
+
+def _mean(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
+    """(count, k) mean of (p, k) values per label."""
+    order = np.argsort(label, kind="stable")
+    size = np.bincount(label, minlength=count)
+    if not count:
+        return np.zeros((0, values.shape[1]))
+    return np.add.reduceat(values[order], np.cumsum(size) - size, axis=0) / size[:, None]

@@ -1,0 +1,247 @@
+"""The learned estimator's geometry, without learning: gauges, input, bins, votes, rigid fits, turns."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View, backproject, pixel_rays
+from active6d_core.object_model import load_object
+from active6d_core.se3 import invert, make_transform, rotation_angle, transform_points
+from active6d_perception.dense.gauge import Turn, gauge_of, turn_about_z
+from active6d_perception.dense.network import DIRECTION_BINS, HEADS, split
+from active6d_perception.dense.network_input import (
+    CHANNELS,
+    network_input,
+    output_camera,
+    pad,
+    pool_depth,
+    ray_rotation,
+    reduce_view,
+)
+from active6d_perception.dense.rigid_fit import kabsch, robust_fit
+from active6d_perception.dense.sphere_bins import CENTRES, density, kernel
+from active6d_perception.dense.turns import turn_evidence
+from active6d_perception.dense.votes import cluster_votes
+
+OBJECTS = {"coffee_cup": Turn.INVISIBLE, "mug": Turn.TOLD_BY_FEATURE, "bunny": Turn.VISIBLE}
+
+
+def random_poses(count, seed=0, distance=0.8):
+    rng = np.random.default_rng(seed)
+    positions = np.column_stack([rng.uniform(-0.2, 0.2, (count, 2)), np.full(count, distance)])
+    return make_transform(Rotation.random(count, rng=rng).as_matrix(), positions)
+
+
+@pytest.mark.parametrize(("name", "turn"), OBJECTS.items())
+def test_gauge_is_found_from_the_description(name, turn):
+    assert gauge_of(load_object(name)).turn is turn
+
+
+def test_axis_of_the_mug_is_the_axis_of_its_inner_wall():
+    model = load_object("mug")
+    gauge = gauge_of(model)
+    assert np.allclose(gauge.T_object_axis[:3, 2], [0, 0, 1])
+    # The body is as wide as it is deep, and the handle sticks out towards +y only.
+    low, high = model.mesh.bounds
+    radius = (high[0] - low[0]) / 2
+    assert np.allclose(gauge.T_object_axis[:2, 3], [low[0] + radius, low[1] + radius], atol=2e-4)
+    handle = np.asarray(model.mesh.vertices)[model.feature_mask("handle", np.asarray(model.mesh.vertices))].mean(axis=0)
+    towards = (handle - gauge.T_object_axis[:3, 3])[:2]
+    assert gauge.T_object_axis[:2, 0] @ towards / np.linalg.norm(towards) > 0.999
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_canonical_frame_sees_the_camera_in_its_xz_half_plane(name):
+    gauge, poses = gauge_of(load_object(name)), random_poses(50)
+    canonical = gauge.canonical_pose(poses)
+    if gauge.turn is Turn.VISIBLE:
+        assert np.allclose(canonical, poses)
+        return
+    eye = invert(canonical)[:, :3, 3]
+    assert np.allclose(eye[:, 1], 0, atol=1e-9)
+    assert (eye[:, 0] > 0).all()
+    assert np.allclose(canonical[:, :3, 2], gauge.axis_pose(poses)[:, :3, 2])
+
+
+def test_canonical_frame_of_a_cup_forgets_its_turn():
+    gauge, poses = gauge_of(load_object("coffee_cup")), random_poses(20)
+    turned = poses @ turn_about_z(np.linspace(0, 6, 20))
+    assert np.allclose(gauge.canonical_pose(poses), gauge.canonical_pose(turned))
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_axis_pose_and_object_pose_are_inverse(name):
+    gauge, poses = gauge_of(load_object(name)), random_poses(5)
+    assert np.allclose(gauge.object_pose(gauge.axis_pose(poses)), poses)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_ray_rotation_is_the_shortest_turn(seed):
+    direction = np.random.default_rng(seed).normal(size=(4, 3))
+    direction[:, 2] = np.abs(direction[:, 2]) + 0.1
+    unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    R = ray_rotation(direction)
+    for i in range(4):
+        axis = np.cross([0, 0, 1], unit[i])
+        angle = np.arctan2(np.linalg.norm(axis), unit[i, 2])
+        expected = Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * angle).as_matrix()
+        assert np.allclose(R[i], expected, atol=1e-5)
+
+
+def test_pooled_depth_stays_on_the_nearest_surface():
+    depth = np.array([[1.0, 1.002, 2.0, np.nan], [1.5, np.nan, 2.01, 2.0]], np.float32)
+    pooled = pool_depth(depth, 2)
+    assert pooled[0, 0] == pytest.approx((1.0 + 1.002) / 2)
+    assert pooled[0, 1] == pytest.approx((2.0 + 2.01 + 2.0) / 3)
+    assert np.isnan(pool_depth(np.full((4, 4), np.nan, np.float32), 2)).all()
+
+
+def test_input_is_translation_free_and_sized_by_distance():
+    camera = PinholeCamera.from_field_of_view(640, 480, 60.0)
+    color = np.full((480, 640, 3), 128, np.uint8)
+    inputs = []
+    for distance in (0.6, 1.2):
+        view = reduce_view(View(0, color, np.full((480, 640), distance, np.float32), camera, np.eye(4)))
+        inputs.append(network_input(view, 0.14))
+    assert inputs[0].shape == (CHANNELS, 240, 320)
+    assert np.isfinite(inputs[0]).all()
+    # A plane across the camera: level against its surroundings, its normal against each ray.
+    assert np.abs(inputs[0][6:8]).max() < 1e-5
+    centre = inputs[0][3:6, 120, 160]
+    assert np.allclose(centre, [0, 0, -1], atol=0.01)
+    rays = pixel_rays(view.camera)
+    cosine = 1 / np.linalg.norm(rays, axis=-1)
+    assert np.allclose(-inputs[0][5, 5:-5, 5:-5], cosine[5:-5, 5:-5], atol=1e-3)
+    assert np.allclose(inputs[0][9] / inputs[1][9], 2.0, rtol=1e-5)
+    assert pad(inputs[0][:, :-3, :-5]).shape == inputs[0].shape
+
+
+def test_view_without_depth_gives_a_finite_input():
+    view = View(
+        0, np.zeros((480, 640, 3), np.uint8), np.full((480, 640), np.nan, np.float32), DEFAULT_CAMERA, np.eye(4)
+    )
+    assert np.isfinite(network_input(reduce_view(view), 0.14)).all()
+
+
+def test_odd_sizes_are_cut_alike():
+    camera = PinholeCamera(645, 483, 500, 500, 320, 240)
+    view = reduce_view(View(0, np.zeros((483, 645, 3), np.uint8), np.ones((483, 645), np.float32), camera, np.eye(4)))
+    assert view.color.shape[:2] == view.depth.shape == (view.camera.height, view.camera.width) == (241, 322)
+    assert (output_camera(view.camera).height, output_camera(view.camera).width) == (120, 161)
+    # The ray through a reduced pixel is the mean of those that it came from.
+    assert np.allclose(pixel_rays(view.camera)[7, 9], pixel_rays(camera)[14:16, 18:20].mean(axis=(0, 1)), atol=1e-6)
+
+
+def test_sphere_bins_are_even_and_keep_directions():
+    nearest = np.sort(np.arccos(np.clip(CENTRES @ CENTRES.T, -1, 1)), axis=1)[:, 1]
+    assert len(CENTRES) == DIRECTION_BINS
+    assert nearest.min() > 0.6 * np.sqrt(4 * np.pi / DIRECTION_BINS)
+    directions = Rotation.random(100, rng=np.random.default_rng(0)).as_matrix()[:, 0]
+    share = kernel(directions)
+    assert np.allclose(share.sum(axis=1), 1, atol=1e-6)
+    mean = share @ CENTRES
+    assert (np.einsum("ni,ni->n", mean / np.linalg.norm(mean, axis=1, keepdims=True), directions) > np.cos(0.12)).all()
+    grid = np.broadcast_to(directions, (100, 100, 3))
+    found = directions[density(share, grid).argmax(axis=1)]
+    assert np.einsum("ni,ni->n", found, directions).min() > np.cos(0.3)
+
+
+def test_split_takes_every_channel_once():
+    answer = np.arange(sum(HEADS.values()))[None]
+    assert np.concatenate(list(split(answer).values()), axis=1).tolist() == answer.tolist()
+
+
+def test_kabsch_agrees_with_scipy():
+    rng = np.random.default_rng(0)
+    source, weight = rng.normal(size=(6, 20, 3)), rng.uniform(0.1, 1, (6, 20))
+    target = transform_points(random_poses(6), source) + 0.05 * rng.normal(size=source.shape)
+    T = kabsch(source, target, weight)
+    for i in range(6):
+        a = source[i] - np.average(source[i], axis=0, weights=weight[i])
+        b = target[i] - np.average(target[i], axis=0, weights=weight[i])
+        expected = Rotation.align_vectors(b, a, weights=weight[i])[0].as_matrix()
+        assert np.allclose(T[i, :3, :3], expected, atol=1e-6)
+        assert np.linalg.det(T[i, :3, :3]) == pytest.approx(1)
+
+
+def test_kabsch_never_mirrors():
+    source = np.random.default_rng(1).normal(size=(1, 10, 3))
+    T = kabsch(source, source * [1, 1, -1], np.ones((1, 10)))
+    assert np.linalg.det(T[0, :3, :3]) == pytest.approx(1)
+
+
+def test_robust_fit_survives_half_outliers():
+    rng = np.random.default_rng(0)
+    n, p = 12, 100
+    truth = random_poses(n, seed=3)
+    source = 0.05 * rng.normal(size=(n, p, 3))
+    target = transform_points(truth, source) + 0.001 * rng.normal(size=source.shape)
+    wrong = rng.random((n, p)) < 0.5
+    target[wrong] += 0.1 * rng.normal(size=(wrong.sum(), 3))
+    weight = np.ones((n, p))
+    weight[:, 90:] = 0  # padding, however wrong, takes no part
+    target[:, 90:] = 7.0
+    T, agreement = robust_fit(source, target, weight, 0.006, np.random.default_rng(1), np.zeros((n, 0, 4, 4)))
+    assert np.linalg.norm(T[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.002
+    assert rotation_angle(T[:, :3, :3], truth[:, :3, :3]).max() < np.radians(1.5)
+    assert np.abs(agreement - (1 - wrong[:, :90].mean(axis=1))).max() < 0.12
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_clusters_of_votes_are_the_objects(seed):
+    rng = np.random.default_rng(seed)
+    diameter = 0.14
+    grid = np.stack(np.meshgrid(*[np.arange(3)] * 3), axis=-1).reshape(-1, 3) * 0.5 * diameter
+    centres = grid[rng.permutation(27)[: rng.integers(1, 20)]]
+    owner = np.repeat(np.arange(len(centres)), rng.integers(30, 300, len(centres)))
+    votes = centres[owner] + 0.004 * rng.normal(size=(len(owner), 3))
+    stray = rng.uniform(-1, 1, (20, 3))
+    clusters = cluster_votes(np.concatenate([votes, stray]), np.ones(len(owner) + 20), diameter)
+    assert len(clusters.centre) == len(centres)
+    distance = np.linalg.norm(clusters.centre[:, None] - centres, axis=-1)
+    matched = distance.argmin(axis=0)
+    assert distance.min(axis=0).max() < 0.003
+    assert (clusters.label[: len(owner)] == matched[owner]).mean() > 0.99
+
+
+def test_no_votes_no_clusters():
+    clusters = cluster_votes(np.zeros((3, 3)), np.ones(3), 0.14)
+    assert len(clusters.centre) == 0
+    assert (clusters.label == -1).all()
+
+
+def test_votes_that_agree_on_nothing_cost_little():
+    votes = np.random.default_rng(0).uniform(-2, 2, (20_000, 3))
+    started = time.process_time()
+    cluster_votes(votes, np.ones(len(votes)), 0.14)
+    assert time.process_time() - started < 5
+
+
+def test_the_part_cannot_be_where_the_camera_looked_through():
+    camera = PinholeCamera.from_field_of_view(160, 120, 60.0)
+    part = np.array([[0.04, 0.0, 0.0], [0.05, 0.0, 0.0]])
+    pose = make_transform(np.eye(3), [0, 0, 0.8])
+    turned = pose @ turn_about_z(np.radians([0.0, 90.0, 180.0]))
+    depth = np.full((120, 160), 0.8, np.float32)
+    points = transform_points(turned, part)
+    u = np.rint(points[..., 0] / points[..., 2] * camera.fx + camera.cx).astype(int)
+    v = np.rint(points[..., 1] / points[..., 2] * camera.fy + camera.cy).astype(int)
+    depth[v[1], u[1]] = 1.2  # seen through at the second turn
+    depth[v[2], u[2]] = 0.5  # hidden at the third
+    measured, through, hidden = turn_evidence(turned[None], part, depth, camera)[0]
+    assert measured > hidden > through
+    assert hidden == 0
+
+
+def test_backprojection_of_the_output_camera_hits_the_same_points():
+    depth = np.ones((240, 320), np.float32)
+    camera = DEFAULT_CAMERA.scaled(0.5)
+    coarse = backproject(pool_depth(depth, 2), output_camera(camera))
+    fine = backproject(depth, camera)
+    assert np.allclose(coarse[3, 5], fine[6:8, 10:12].mean(axis=(0, 1)), atol=1e-6)

@@ -1,0 +1,361 @@
+"""The learned estimator learns: targets, files of views, losses, training, resuming, and what comes out of it."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from active6d_core.camera import DEFAULT_CAMERA, View, backproject
+from active6d_core.metrics import e_add
+from active6d_core.object_model import load_object
+from active6d_core.se3 import invert, look_at, make_transform, transform_points
+from active6d_perception.dense.decoding import DecodingParameters
+from active6d_perception.dense.estimator import DenseEstimator, DenseParameters
+from active6d_perception.dense.gauge import Turn, gauge_of
+from active6d_perception.dense.network import DenseNetwork, NetworkSize, split
+from active6d_perception.dense.network_input import output_camera, ray_frames, ray_rotation
+from active6d_perception.dense.sphere_bins import CENTRES
+from active6d_perception.dense.weights_file import TrainedNetwork, load_network, save_network
+from active6d_perception.estimator import create_estimator, list_estimators
+from active6d_perception.training.augmentation import augment
+from active6d_perception.training.batches import TrainingViews, batches, input_tensor
+from active6d_perception.training.loop import TrainingOptions, train
+from active6d_perception.training.losses import LossWeights, loss_terms, total
+from active6d_perception.training.samples import make_sample, read_shard, write_shard
+from active6d_perception.training.targets import make_targets
+from active6d_perception.training.validation import validate
+from active6d_sim.renderer import SceneRenderer
+from active6d_sim.scene import Bin, Scene
+from active6d_sim.training_views import FIRST_SEED, random_camera, training_heap
+
+SMALL = NetworkSize((8, 12, 16, 24), 16)
+OBJECTS = ("coffee_cup", "mug", "bunny")
+
+
+def view_of(name, seed=0):
+    """A sample of four well visible objects that lie nowhere near each other, and the renderer's coordinate map."""
+    model, rng = load_object(name), np.random.default_rng(seed)
+    places = np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]) * 0.09 + [0, 0, 0.07]
+    poses = make_transform(Rotation.random(4, rng=rng).as_matrix(), places)
+    scene = Scene(name, f"{name}/seed/0", 0, poses, Bin(0.4, 0.4, 0.05), np.ones((1, 4)))
+    renderer = SceneRenderer(scene, model=model, threads=1)
+    T_world_camera = look_at(np.array([0.25, -0.4, 0.6]), np.zeros(3))
+    seen = renderer.render(T_world_camera, DEFAULT_CAMERA)
+    truth = renderer.render(T_world_camera, DEFAULT_CAMERA.scaled(0.25), object_coordinates=True)
+    view = View(0, seen.color, seen.depth, DEFAULT_CAMERA, T_world_camera)
+    sample = make_sample(view, truth.depth, truth.instance, invert(T_world_camera) @ poses, np.ones(4))
+    return sample, truth.object_coordinates, view
+
+
+@pytest.fixture(scope="module")
+def mug_view():
+    return view_of("mug")
+
+
+def right_answer(sample, targets):
+    """What a perfect network would say."""
+    h, w = sample.surface_depth.shape
+    answer = np.zeros((sum(value.shape[0] for value in split(np.zeros((200, 1)), axis=0).values()), h, w), np.float32)
+    parts = split(answer, axis=0)
+    parts["mask"][0] = np.where(targets.mask > 0, 6, -6)
+    for name in ("centre", "coordinates", "axis"):
+        parts[name].reshape(3, -1)[:, targets.pixel] = getattr(targets, name).T
+    parts["direction"].reshape(len(CENTRES), -1)[:, targets.pixel] = np.log(targets.direction.T + 1e-6)
+    return answer
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_targets_agree_with_the_renderer(name):
+    sample, coordinates, _ = view_of(name)
+    model = load_object(name)
+    gauge = gauge_of(model)
+    targets = make_targets(sample, gauge, model.diameter)
+    rendered = coordinates.reshape(-1, 3)[targets.pixel]
+    instance = sample.instance.ravel()[targets.pixel]
+    # Back from canonical coordinates to the object's frame by the poses alone.
+    to_object = invert(sample.T_camera_object) @ gauge.canonical_pose(sample.T_camera_object)
+    if gauge.turn is Turn.INVISIBLE:
+        about = [np.hypot(*rendered[:, :2].T), rendered[:, 2]]
+        said = targets.coordinates * model.diameter
+        assert np.allclose([np.hypot(*said[:, :2].T), said[:, 2]], about, atol=5e-4)
+    back = np.einsum("pij,pj->pi", to_object[instance][:, :3, :3], targets.coordinates * model.diameter)
+    assert np.allclose(back + to_object[instance][:, :3, 3], rendered, atol=5e-4)
+    # Votes, axes and directions, each undone by hand.
+    camera = output_camera(sample.view.camera)
+    points = backproject(sample.surface_depth, camera).reshape(-1, 3)[targets.pixel]
+    R = ray_frames(camera).reshape(-1, 3, 3)[targets.pixel]
+    votes = points + model.diameter * np.einsum("pij,pj->pi", R, targets.centre)
+    origin = transform_points(sample.T_camera_object, gauge.T_object_axis[None, :3, 3])[:, 0]
+    assert np.allclose(votes, origin[instance], atol=1e-5)
+    frames = ray_rotation(origin)
+    axis = (sample.T_camera_object[:, :3, :3] @ gauge.T_object_axis[:3, 2])[instance]
+    assert np.allclose(np.einsum("pij,pj->pi", frames[instance], targets.axis), axis, atol=1e-5)
+    if gauge.turn is Turn.INVISIBLE:
+        assert not targets.direction.any()
+    else:
+        x = np.einsum(
+            "nij,nj->ni", frames.swapaxes(1, 2), sample.T_camera_object[:, :3, :3] @ gauge.T_object_axis[:3, 0]
+        )
+        assert (targets.direction.argmax(axis=1) == (x @ CENTRES.T).argmax(axis=1)[instance]).all()
+        assert np.allclose(targets.direction.sum(axis=1), 1, atol=1e-5)
+    assert targets.weight.mean() == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+@pytest.mark.parametrize("coordinates", [True, False])
+def test_a_right_answer_gives_right_poses(name, coordinates):
+    sample, _, _ = view_of(name)
+    model = load_object(name)
+    gauge = gauge_of(model)
+    answer = right_answer(sample, make_targets(sample, gauge, model.diameter))
+    parameters = DenseParameters(decoding=DecodingParameters(coordinates=coordinates))
+    trained = TrainedNetwork(DenseNetwork(SMALL), gauge, name, model.diameter, SMALL)
+    estimator = DenseEstimator(model, trained, parameters)
+    estimator.ask = lambda view: answer
+    poses, label = estimator.locate(sample.view)
+    assert len(poses.score) == 4
+    errors = e_add(model, poses.T_camera_object[:, None], sample.T_camera_object[None])
+    assert errors.min(axis=0).max() < 0.03 * model.diameter
+    nearest = errors.argmin(axis=1)
+    # Labels name the right pixels.
+    fine = sample.instance.repeat(2, axis=0).repeat(2, axis=1)
+    for index, instance in enumerate(poses.instance):
+        assert (fine[label == instance + 1] == nearest[index]).mean() > 0.97
+    assert (poses.score > 0.5).all()
+
+
+def test_a_hidden_handle_is_told(mug_view):
+    sample, _, _ = mug_view
+    model = load_object("mug")
+    gauge = gauge_of(model)
+    targets = make_targets(sample, gauge, model.diameter)
+    answer = right_answer(sample, targets)
+    split(answer, axis=0)["direction"][:] = 0  # the network cannot tell
+    unsure = DenseEstimator(model, TrainedNetwork(DenseNetwork(SMALL), gauge, "mug", model.diameter, SMALL))
+    unsure.ask = lambda view: answer
+    # Without depth around the objects, nothing else speaks about the turn either.
+    poses, _ = unsure.locate(sample.view)
+    sure = DenseEstimator(model, TrainedNetwork(DenseNetwork(SMALL), gauge, "mug", model.diameter, SMALL))
+    sure.ask = lambda view: right_answer(sample, targets)
+    confident, _ = sure.locate(sample.view)
+    assert poses.certainty.mean() < 0.8 * confident.certainty.mean()
+    assert confident.certainty.min() > 0.8
+
+
+def test_shards_come_back(tmp_path, mug_view):
+    sample, _, _ = mug_view
+    write_shard(tmp_path / "a.npz", [sample, sample])
+    back = read_shard(tmp_path / "a.npz")
+    assert len(back) == 2
+    assert (back[1].view.color == sample.view.color).all()
+    assert np.allclose(back[1].view.depth, sample.view.depth, atol=5.1e-5, equal_nan=True)
+    assert np.allclose(back[1].surface_depth, sample.surface_depth, atol=5.1e-5, equal_nan=True)
+    assert (back[1].instance == sample.instance).all()
+    assert (back[1].T_camera_object == sample.T_camera_object).all()
+    assert back[1].view.camera == sample.view.camera
+    (tmp_path / "b.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"b\.npz: not a file of training views"):
+        read_shard(tmp_path / "b.npz")
+
+
+def test_truth_of_another_size_is_refused(mug_view):
+    sample, _, view = mug_view
+    with pytest.raises(ValueError, match="truth of a training view must be"):
+        make_sample(view, np.ones((10, 10)), np.ones((10, 10), int), sample.T_camera_object, np.ones(4))
+
+
+def test_augmentation_keeps_the_truth_and_never_mirrors(mug_view):
+    view = mug_view[0].view
+    for seed in range(5):
+        changed = augment(view, np.random.default_rng(seed))
+        both = np.isfinite(changed.depth) & np.isfinite(view.depth)
+        assert both.mean() > 0.8
+        assert np.abs(changed.depth - view.depth)[both].max() < 0.008
+        gray, before = changed.color.mean(axis=-1).ravel(), view.color.mean(axis=-1).ravel()
+        assert np.corrcoef(gray, before)[0, 1] > 0.9
+
+
+def test_heaps_to_learn_from_share_no_seed_with_stored_scenes():
+    from active6d_sim.scene_store import SPLIT_SEEDS, SPLITS
+
+    assert all(SPLIT_SEEDS[split] + count <= FIRST_SEED for split, count in SPLITS.items())
+    with pytest.raises(ValueError, match="seeds from"):
+        training_heap(load_object("mug"), SPLIT_SEEDS["test"])
+
+
+def test_random_cameras_look_at_the_bin_from_above():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        _, T = random_camera(rng)
+        assert 0.5 < np.linalg.norm(T[:3, 3]) < 1.1
+        assert T[2, 3] > 0.05
+        assert T[:3, 2] @ -T[:3, 3] / np.linalg.norm(T[:3, 3]) > np.cos(np.radians(25))
+
+
+def test_loss_is_least_at_the_right_answer(mug_view):
+    sample, _, _ = mug_view
+    model = load_object("mug")
+    targets = make_targets(sample, gauge_of(model), model.diameter)
+    right = torch.from_numpy(right_answer(sample, targets))[None]
+    best = loss_terms(right, [targets])
+    for name, part in split(torch.arange(right.shape[1])[None]).items():
+        if name.endswith("scale"):
+            continue
+        worse = right.clone()
+        worse[:, part[0]] += 0.3 * torch.randn(worse[:, part[0]].shape, generator=torch.Generator().manual_seed(0))
+        assert loss_terms(worse, [targets])[name] > best[name] + 1e-4
+    assert float(best["axis"]) == pytest.approx(0, abs=1e-5)
+    assert torch.isfinite(total(best, LossWeights()))
+
+
+def test_scale_is_learned_from_the_error(mug_view):
+    """The likelihood is largest where the scale is the mean error over three."""
+    sample, _, _ = mug_view
+    model = load_object("mug")
+    targets = make_targets(sample, gauge_of(model), model.diameter)
+    answer = torch.from_numpy(right_answer(sample, targets))[None]
+    parts = split(answer)
+    parts["centre"][:, 0] += 0.3
+    losses = []
+    for scale in (0.05, 0.1, 0.2):
+        parts["centre_scale"][:] = np.log(scale)
+        losses.append(float(loss_terms(answer, [targets])["centre"]))
+    assert losses[1] < min(losses[0], losses[2])
+
+
+def test_a_small_network_learns_a_view_by_heart(mug_view):
+    """Every head's loss falls, and the axes and centres come out of a few hundred steps on one view."""
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    sample, _, view = view_of("coffee_cup")
+    model = load_object("coffee_cup")
+    gauge = gauge_of(model)
+    targets = make_targets(sample, gauge, model.diameter)
+    inputs = input_tensor(sample.view, model.diameter)[None].contiguous(memory_format=torch.channels_last)
+    size = NetworkSize((12, 20, 28, 40), 20)
+    network = DenseNetwork(size).to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=6e-3)
+    losses = []
+    for _ in range(120):
+        loss = total(loss_terms(network(inputs), [targets]), LossWeights())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0] - 4
+    estimator = DenseEstimator(model, TrainedNetwork(network, gauge, model.name, model.diameter, size))
+    hypotheses = estimator.estimate(view)
+    errors = e_add(model, hypotheses.T_camera_object[:, None], sample.T_camera_object[None])
+    assert len(hypotheses) == 4
+    assert (errors.min(axis=0) < 0.1 * model.diameter).all()
+    assert hypotheses.segmentation.shape == view.depth.shape
+    assert set(estimator.stage_ms) == {"input", "network", "decoding", "turns", "refinement", "masks"}
+
+
+def quick(**changes):
+    options = {"steps": 4, "batch": 2, "checkpoint_every": 2, "validate_every": 4, "workers": 0, "size": SMALL}
+    return TrainingOptions(**{**options, **changes})
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, mug_view):
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("training")
+    write_shard(folder / "views.npz", [mug_view[0]] * 2)
+    best = train(load_object("mug"), [folder / "views.npz"], [mug_view[0]], folder / "run", quick())
+    return folder, best
+
+
+def test_training_writes_weights_and_curves(trained):
+    folder, best = trained
+    history = json.loads((folder / "run" / "curves.json").read_text())
+    assert [entry["step"] for entry in history] == [4]
+    assert (folder / "run" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    loaded = load_network(best, load_object("mug"))
+    assert loaded.training["validation"]["step"] == 4
+    assert not loaded.network.training
+
+
+def test_training_goes_on_where_it_stopped(tmp_path, trained, mug_view):
+    folder, _ = trained
+    shards, model = [folder / "views.npz"], load_object("mug")
+    steps = []
+
+    def interrupt(report):
+        steps.append(report.step)
+        if report.step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(model, shards, [mug_view[0]], tmp_path, quick(), on_step=interrupt)
+    train(model, shards, [mug_view[0]], tmp_path, quick(), on_step=lambda report: steps.append(report.step))
+    assert steps == [1, 2, 3, 3, 4]  # the checkpoint is of step 2
+    with pytest.raises(ValueError, match="other options"):
+        train(model, shards, [mug_view[0]], tmp_path, quick(learning_rate=1e-4))
+    (tmp_path / "state.safetensors").write_bytes(b"broken")
+    with pytest.raises(ValueError, match=r"state\.safetensors: cannot go on"):
+        train(model, shards, [mug_view[0]], tmp_path, quick())
+
+
+def test_validation_rates_a_perfect_network(mug_view, monkeypatch):
+    sample, _, _ = mug_view
+    model = load_object("mug")
+    gauge = gauge_of(model)
+    answer = right_answer(sample, make_targets(sample, gauge, model.diameter))
+    monkeypatch.setattr(DenseEstimator, "ask", lambda self, view: answer)
+    rates = validate(model, TrainedNetwork(DenseNetwork(SMALL).eval(), gauge, "mug", model.diameter, SMALL), [sample])
+    assert rates["add_half"] == rates["add_tenth"] == rates["adds_half"] == rates["precision"] == 1.0
+
+
+def test_no_views_is_said(tmp_path):
+    with pytest.raises(ValueError, match="no training views"):
+        next(batches(TrainingViews([], gauge_of(load_object("mug")), 0.14, (0,)), 1, 0))
+
+
+def test_dense_is_registered_and_takes_weights(trained):
+    _, best = trained
+    assert "dense" in list_estimators()
+    view = View(
+        0, np.zeros((480, 640, 3), np.uint8), np.full((480, 640), np.nan, np.float32), DEFAULT_CAMERA, np.eye(4)
+    )
+    assert len(create_estimator("dense", load_object("mug"), weights=str(best)).estimate(view)) == 0
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "no such file of weights"),
+        (lambda path: path.with_suffix(".json").unlink(), "no such file of weights"),
+        (lambda path: path.write_bytes(path.read_bytes()[:5000]), "damaged"),
+        (lambda path: path.with_suffix(".json").write_text("{"), "damaged"),
+        (lambda path: change(path, object="bunny"), "made for bunny"),
+        (lambda path: change(path, diameter=0.5), "made for mug"),
+        (lambda path: change(path, heads={"mask": 1}), "another version"),
+        (lambda path: change(path, size={"widths": [8, 8, 8, 8], "last": 8}), "not the weights"),
+        (lambda path: change(path, size={"widths": [8, 8], "last": 8}), "bad description"),
+        (lambda path: change(path, T_object_axis=[[1, 2], [3, 4]]), "bad description"),
+    ],
+)
+def test_bad_weights_give_one_clear_line(tmp_path, trained, damage, message):
+    model = load_object("mug")
+    path = tmp_path / "mug.safetensors"
+    save_network(path, load_network(trained[1], model))
+    load_network(path, model)
+    damage(path)
+    with pytest.raises(ValueError, match=message) as caught:
+        create_estimator("dense", model, weights=str(path))
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+
+
+def change(path, **keys):
+    described = path.with_suffix(".json")
+    described.write_text(json.dumps({**json.loads(described.read_text()), **keys}))
+
+
+@pytest.mark.parametrize("setting", [{"min_score": 2.0}, {"alternatives": 0}])
+def test_bad_settings_are_named(setting):
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        DenseParameters(**setting)
