@@ -10,7 +10,7 @@ TESTS = Path(__file__).parent
 SOURCES = sorted(str(path) for path in (TESTS.parent / "src").glob("active6d_*"))
 sys.path[:0] = [str(TESTS), *(path for path in SOURCES if path not in sys.path)]
 # Child processes (nodes under `--processes`, the command) import the same sources.
-os.environ["PYTHONPATH"] = os.pathsep.join([*SOURCES, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+os.environ["PYTHONPATH"] = os.pathsep.join([str(TESTS), *SOURCES, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
 # Must be set before the first rclpy import.
 os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

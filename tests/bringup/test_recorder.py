@@ -15,11 +15,11 @@ from rclpy.serialization import serialize_message
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
-from stub_episode import StubEpisode, is_latched
 
 from active6d_bringup.nodes.episode_recorder import EpisodeRecorderNode
 from active6d_bringup.recording import CONTRACT, TYPESTORE, RecordingError, stamp_of
 from active6d_core.node import GraphNode
+from stub_episode import StubEpisode, is_latched
 
 TYPES = {topic.name: topic.type for topic in CONTRACT}
 

@@ -73,6 +73,8 @@ class Graph(Protocol):
     """A running graph, whatever its processes."""
 
     context: Context
+    restarted: list[str]
+    """nodes that died and were started again, in order"""
 
     def add(self, node: Node) -> None:
         """Spin one more node of the caller's in this process."""
@@ -103,6 +105,7 @@ class ComposedGraph:
         self.context = open_context(description)
         self.executor = EventsExecutor(context=self.context)
         self.nodes: dict[str, Node] = {}
+        self.restarted: list[str] = []
         self._guests: list[Node] = []
 
     def add(self, node: Node) -> None:

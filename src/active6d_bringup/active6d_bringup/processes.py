@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
@@ -20,7 +21,6 @@ from active6d_bringup.composition import NODES, GraphDescription, OnEvent, open_
 #: Nodes that an episode survives: they find their inputs again as latched messages.
 RESTARTED = ("hypothesis_fusion", "pose_estimator")
 _RESTARTS = 5
-_START_SECONDS = 60.0
 _STOP_SECONDS = 15.0
 
 
@@ -32,10 +32,18 @@ class ProcessGraph:
     """One process a node. A node that dies is reported, and started again if the episode can survive that.
 
     No process outlives this one: they are ended by :meth:`close`, and by the kernel if this process is killed.
+
+    Args:
+        description: of the graph.
+        on_event: told in words what happens to the nodes.
+        patience: seconds that a node has to come up, and again to set itself up.
     """
 
-    def __init__(self, description: GraphDescription, on_event: OnEvent = lambda text: None) -> None:
+    def __init__(
+        self, description: GraphDescription, on_event: OnEvent = lambda text: None, patience: float = 120.0
+    ) -> None:
         self._description = description
+        self._patience = patience
         self._on_event = on_event
         self.context = open_context(description)
         self.executor = SingleThreadedExecutor(context=self.context)
@@ -45,7 +53,7 @@ class ProcessGraph:
         self.executor.add_node(self._node)
         self._guests: list[Node] = []
         self.processes: dict[str, subprocess.Popen] = {}
-        self.restarts = dict.fromkeys(RESTARTED, 0)
+        self.restarted: list[str] = []
         self._started = False
         self._complete = self._node.create_client(Trigger, "episode_recorder/complete")
         self._recorded = None
@@ -56,10 +64,10 @@ class ProcessGraph:
         self.executor.add_node(node)
 
     def start(self) -> None:
-        """Start every process, let them find each other, then configure and activate the nodes in order.
+        """Start every process, let them find each other, then configure all of them at once and activate them in order.
 
         Raises:
-            ProcessError: a node ended, or did not come up within a minute.
+            ProcessError: a node ended, or did not come up in time.
         """
         for name in self._description.in_order():
             self._on_event(f"starting {name}")
@@ -71,9 +79,9 @@ class ProcessGraph:
             self._wait(client.service_is_ready, f"{name} did not come up")
         if "episode_recorder" in clients:
             self._wait(self._recorder_connected, "episode_recorder did not find every topic of the graph")
-        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
-            for name, client in clients.items():
-                self._change(name, client, transition)
+        self._change(clients, Transition.TRANSITION_CONFIGURE)
+        for name, client in clients.items():
+            self._change({name: client}, Transition.TRANSITION_ACTIVATE)
         self._started = True
 
     def spin_once(self, timeout: float) -> None:
@@ -96,7 +104,7 @@ class ProcessGraph:
         if not self._recorded.done():
             return ["the recorder's answer"]
         answer, self._recorded = self._recorded.result(), None
-        return [] if answer.success else [answer.message]
+        return [] if answer.success else [f"episode_recorder, {answer.message}"]
 
     def close(self) -> None:
         """Interrupt every process, the recorder last so that it sees all of them end; kill what does not listen."""
@@ -128,17 +136,17 @@ class ProcessGraph:
         del self.processes[name]
         if not self._started or code == 2 or name not in RESTARTED:
             raise ProcessError(f"{name} ended ({cause}); see its own message above")
-        if self.restarts[name] == _RESTARTS:
+        if self.restarted.count(name) == _RESTARTS:
             raise ProcessError(f"{name} ended ({cause}) for the {_RESTARTS + 1}th time; giving up")
-        self.restarts[name] += 1
+        self.restarted.append(name)
         self._on_event(f"{name} died ({cause}), starting it again")
         self._spawn(name, autostart=True)
 
     def _wait(self, predicate: Callable[[], bool], failure: str) -> None:
-        deadline = time.monotonic() + _START_SECONDS
+        deadline = time.monotonic() + self._patience
         while not predicate():
             if time.monotonic() > deadline:
-                raise ProcessError(f"{failure} within {_START_SECONDS:.0f} s")
+                raise ProcessError(f"{failure} within {self._patience:.0f} s")
             self.spin_once(0.05)
 
     def _recorder_connected(self) -> bool:
@@ -151,11 +159,13 @@ class ProcessGraph:
         finally:
             self._node.destroy_client(client)
 
-    def _change(self, name: str, client, transition: int) -> None:
-        answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
-        self._wait(answer.done, f"{name} did not answer")
-        if not answer.result().success:
-            raise ProcessError(f"{name} could not start; see its own message above")
+    def _change(self, clients: dict[str, Client], transition: int) -> None:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        answers = {name: client.call_async(request) for name, client in clients.items()}
+        for name, answer in answers.items():
+            self._wait(answer.done, f"{name} did not answer")
+            if not answer.result().success:
+                raise ProcessError(f"{name} could not start; see its own message above")
 
 
 def _end(processes: list[subprocess.Popen]) -> None:

@@ -176,7 +176,7 @@ def describe_missing(topics: Iterable[str]) -> str:
     }
     topics = list(topics)
     nodes = {node for prefix, node in owner.items() for topic in topics if topic.startswith(prefix)}
-    return f"{', '.join(sorted(nodes)) or 'no node'} (waiting for {', '.join(topics)})"
+    return f"{', '.join(sorted(nodes))} (waiting for {', '.join(topics)})" if nodes else ", ".join(topics)
 
 
 def _offered(topic: RecordedTopic) -> Qos:

@@ -128,7 +128,7 @@ def replay(
     stamps = [step.stamp for episode in episodes for step in episode.steps]
     recorded = _read_compared(settings.bag)
     description = describe(settings, episodes[0].object)
-    with interruptible() as interrupted, running(make_graph(description, settings.processes, on_event)) as graph:
+    with interruptible() as interrupted, running(make_graph(settings, description, on_event)) as graph:
         listener = _Listener(graph.context)
         graph.add(listener)
         started = time.monotonic()
