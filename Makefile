@@ -13,8 +13,8 @@ setup:  ## make .venv ready (done by the others, too)
 
 demo: setup  ## one episode on a heap of mugs: a bag and a report in bags/demo
 	rm -rf $(DEMO)
-	$(BIN)/active6d episode --object mug --seed 7 --policy lowest-score --steps 5 --bag $(DEMO)
-	$(BIN)/active6d report $(DEMO)
+	$(BIN)/active6d episode --object mug --seed 7 --policy lowest-score --steps 5 --bag $(DEMO) --report $(DEMO)/report.html
+	@echo "Open $(DEMO)/report.html in a browser; the bag beside it opens in Foxglove, ros2 bag and rosbags."
 
 test: setup  ## all tests
 	$(BIN)/python -m pytest tests
@@ -22,5 +22,5 @@ test: setup  ## all tests
 lint: setup  ## ruff on all Python files
 	$(BIN)/ruff check src tests scripts
 
-clean:  ## remove .venv, builds and recorded bags
-	rm -rf .venv ros2_ws/{build,install,log} bags/* src/*/*.egg-info src/*/build .pytest_cache .ruff_cache .hypothesis
+clean:  ## remove .venv, builds and the demo
+	rm -rf .venv ros2_ws/{build,install,log} $(DEMO) src/*/*.egg-info src/*/build .pytest_cache .ruff_cache .hypothesis
