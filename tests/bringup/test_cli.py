@@ -15,6 +15,8 @@ from typer.testing import CliRunner
 from active6d_bringup.cli import app
 from active6d_bringup.cli.episode import parse_overrides
 from active6d_bringup.cli.output import write_file, write_json
+from active6d_core.se3 import make_transform
+from active6d_sim.scene import Bin, Scene
 
 
 def run(*arguments: str):
@@ -156,3 +158,59 @@ def test_files_are_written_whole_or_not_at_all(tmp_path):
         write_file(tmp_path / "folder", "text")
     assert sorted(item.name for item in tmp_path.iterdir()) == ["deep", "folder"]
     assert Path(path).stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["scenes", "show", "mug/test"], "not of the form mug/test/3"),
+        (["scenes", "show", "mug/test/99"], "no scene 'mug/test/99'"),
+        (["scenes", "show", "teapot/seed/1"], "unknown object 'teapot'"),
+        (["scenes", "show", "mug/seed/7", "--view", "100"], "the grid has views 0 to 99"),
+        (["scenes", "report", "--split", "exam"], "no scene 'mug/exam/0'"),
+        (["scenes", "generate", "--split", "exam"], "unknown split 'exam'"),
+        (["benchmark", "graph", "--object", "teapot"], "unknown object 'teapot'"),
+        (["benchmark", "estimator", "--split", "exam"], "unknown split 'exam'"),
+        (["benchmark", "estimator", "--estimator", "magic"], "unknown estimator 'magic'"),
+    ],
+)
+def test_bad_scene_or_benchmark_is_one_line_and_exit_code_2(arguments, words):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert words in result.stderr.strip().splitlines()[-1]
+
+
+def make_stored_scenes(folder: Path, visible_fraction: np.ndarray) -> None:
+    """Ten test scenes of one mug lying alone, with made-up visible fractions for its several objects."""
+    n = visible_fraction.shape[1]
+    poses = make_transform(np.eye(3), np.c_[0.2 * np.arange(n), np.zeros(n), np.full(n, 0.05)])
+    (folder / "mug").mkdir(parents=True)
+    for index in range(10):
+        scene = Scene("mug", f"mug/test/{index}", index, poses, Bin(0.4, 0.4, 0.05), visible_fraction)
+        scene.save(folder / "mug" / f"test_{index:02d}.npz")
+
+
+def test_scenes_report_counts_objects_that_are_half_visible(tmp_path, monkeypatch):
+    # Seen from everywhere; from half the views of every elevation; from one view only; from nowhere.
+    fraction = np.zeros((100, 4))
+    fraction[:, 0] = 0.9
+    fraction[np.arange(100) % 20 < 10, 1] = 0.5
+    fraction[17, 2] = 0.6
+    fraction[:, 3] = 0.49
+    make_stored_scenes(tmp_path, fraction)
+    monkeypatch.setenv("ACTIVE6D_SCENE_PATH", str(tmp_path))
+    result = run("scenes", "report", "--json", str(tmp_path / "report.json"))
+    assert result.exit_code == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["counts"] == [4] * 10
+    assert report["all_views"] == 0.75
+    assert report["oracle"] == 0.75
+    assert report["revolution"] == 0.5
+    assert report["one_view"] == pytest.approx((1 + 0.5 + 0.01) / 4, abs=0.05)
+
+
+def test_scenes_show_draws_the_views(tmp_path):
+    result = run("scenes", "show", "bunny/seed/3", "--view", "45", "--view", "90", "--png", str(tmp_path / "scene.png"))
+    assert result.exit_code == 0
+    assert "azimuth  90°   elevation 45°" in result.stdout
+    assert Image.open(tmp_path / "scene.png").size == (1280, 960)

@@ -119,10 +119,9 @@ class _Views:
         """The views of (scene, view) pairs, one by one."""
         sphere = ViewSphere()
         for done, (index, number) in enumerate(pairs):
-            on_view(done, len(pairs))
+            on_view(done + 1, len(pairs))
             if self._current is None or self._current[0] != index:
                 self._current = index, Simulator(self._scenes[index], noise=self._noise, seed=self._seed)
             scene = self._scenes[index]
             view = self._current[1].capture(sphere.pose(sphere.positions[number]), (number + 1) * 1_000_000_000)
             yield LabelledView(view, scene.T_world_object, scene.visible_fraction[number])
-        on_view(len(pairs), len(pairs))
