@@ -5,7 +5,7 @@ their boxes in every view. Clustering and suppression are those of :mod:`active6
 fusion node calls, so results are those of :class:`~active6d_perception.fusion.SceneFusion` for the same views.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.metrics import MISSED_E_ADD, SceneScore, score_errors
 from active6d_core.se3 import invert
 from active6d_perception.clustering import cluster_groups, suppress_neighbours
-from active6d_perception.fusion import FusionParameters, preference, project_features, summarise
+from active6d_perception.fusion import FusionParameters, preference, project_features
 from active6d_perception.model_views import model_views
 from active6d_perception.symmetric_distance import SymmetricDistance
 
@@ -33,6 +33,7 @@ class FusedBatch:
 
     Attributes:
         objects: (E, n) rows of the accumulated objects, best verified first, -1 padding.
+        leaders: (E, n) the same as indices into ``members``, -1 padding.
         seen: (E, n) row of each object's best hypothesis in the current view, -1 without one.
         episode: (k,) episode of each member.
         members: (k,) rows of all hypotheses of an episode's views, best verified first.
@@ -40,6 +41,7 @@ class FusedBatch:
     """
 
     objects: np.ndarray
+    leaders: np.ndarray
     seen: np.ndarray
     episode: np.ndarray
     members: np.ndarray
@@ -159,24 +161,14 @@ class BankLookup:
         now = np.flatnonzero(self.view[rows] == current[episode])[::-1]
         seen[labels[now]] = rows[now]
         objects = np.where(kept, rows[table], -1)
-        return FusedBatch(objects, np.where(kept, seen[table], -1), episode, rows, labels)
+        return FusedBatch(objects, np.where(kept, table, -1), np.where(kept, seen[table], -1), episode, rows, labels)
 
     def _cluster(self, episode: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """(k,) index of the first member of each row's cluster."""
         labels = np.arange(len(rows))
-        key = episode * len(self._size) + self._component[rows]
-        order = np.argsort(key, kind="stable")
-        key = key[order]
-        starts = np.flatnonzero(np.append(True, key[1:] != key[:-1])[: len(key)])
-        sizes = np.diff(starts, append=len(key))
-        for fewest, most in _SIZES:
-            groups = np.flatnonzero((sizes >= fewest) & (sizes <= most))
-            if len(groups):
-                place = np.arange(sizes[groups].max())
-                valid = place < sizes[groups, None]
-                members = order[starts[groups, None] + np.where(valid, place, 0)]
-                local = cluster_groups(self._distances(rows[members]), valid, self._cut)
-                labels[members[valid]] = np.take_along_axis(members, local, axis=1)[valid]
+        for members, valid in _groups_by_size(episode * len(self._size) + self._component[rows]):
+            local = cluster_groups(self._distances(rows[members]), valid, self._cut)
+            labels[members[valid]] = np.take_along_axis(members, local, axis=1)[valid]
         return labels
 
     def features(self, fused: FusedBatch, scene: np.ndarray, current: np.ndarray) -> np.ndarray:
@@ -200,28 +192,36 @@ class BankLookup:
         self._projected[view, rows] = np.column_stack([box, depth])
         self._is_projected[view, scene] = True
 
+    def describe(self, fused: FusedBatch, scene: np.ndarray, current: np.ndarray) -> list[SceneObjects]:
+        """The accumulated objects of every episode, as the fusion node publishes them."""
+        features = self.features(fused, scene, current)
+        count, M = len(fused.members), len(self.sphere)
+        seen_from = np.unique(fused.labels * M + self.view[fused.members]) // M
+        support, spread = np.bincount(seen_from, minlength=count), np.zeros(count)
+        for members, valid in _groups_by_size(fused.labels):
+            pairs = valid[:, :, None] & valid[:, None]
+            widest = np.where(pairs, self._distances(fused.members[members]), 0.0).max(axis=(1, 2))
+            spread[fused.labels[members[:, 0]]] = widest
+        described = []
+        for episode, leaders in enumerate(fused.leaders):
+            leaders = leaders[leaders >= 0]
+            rows, feature = fused.members[leaders], features[episode, : len(leaders)]
+            objects = SceneObjects(
+                T_world_object=self.T_world_object[rows],
+                verification=self.verification[rows],
+                score=self.score[rows],
+                box=feature[:, :4],
+                depth=feature[:, 4],
+                support=support[leaders],
+                spread=spread[leaders],
+            )
+            described.append(objects)
+        return described
+
     def objects(self, scene: int, views: Sequence[int]) -> SceneObjects:
-        """The objects of one scene after ``views``, the last of them current, as the fusion node publishes them."""
+        """:meth:`describe` one scene after ``views``, the last of them current."""
         scenes, current = np.array([scene]), np.array([views[-1]])
-        fused = self.fuse(scenes, np.array([views]), current)
-        features = self.features(fused, scenes, current)[0]
-        rows = fused.objects[0]
-        chosen = np.searchsorted(fused.members, rows)
-        component = self._component[fused.members]
-        same = component[:, None] == component
-        place, members = self._place[fused.members], component[:, None]
-        entry = self._block_start[members] + place[:, None] * self._size[members] + place
-        distance = np.where(same, self._block[np.where(same, entry, 0)], np.inf)
-        support, spread, _ = summarise(fused.labels, chosen, self.view[fused.members], distance, views[-1])
-        return SceneObjects(
-            T_world_object=self.T_world_object[rows],
-            verification=self.verification[rows],
-            score=self.score[rows],
-            box=features[:, :4],
-            depth=features[:, 4],
-            support=support,
-            spread=spread,
-        )
+        return self.describe(self.fuse(scenes, np.array([views]), current), scenes, current)[0]
 
     def object_errors(self, fused: FusedBatch) -> np.ndarray:
         """(E, o) e_ADD of each true object's best accumulated hypothesis, metres, at most 50 mm."""
@@ -235,3 +235,25 @@ class BankLookup:
             score_errors(self.errors[rows[rows >= 0], :count], self.model.diameter)
             for rows, count in zip(fused.objects, counts, strict=True)
         ]
+
+
+def _groups_by_size(key: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Items with equal keys, by groups of two and more.
+
+    Args:
+        key: (k,) integers.
+
+    Yields:
+        (B, m) indices of the items of B groups of similar size, rising, padded with the first; (B, m) bool, which are
+        not padding.
+    """
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    starts = np.flatnonzero(np.append(True, key[1:] != key[:-1])[: len(key)])
+    sizes = np.diff(starts, append=len(key))
+    for fewest, most in _SIZES:
+        groups = np.flatnonzero((sizes >= fewest) & (sizes <= most))
+        if len(groups):
+            place = np.arange(sizes[groups].max())
+            valid = place < sizes[groups, None]
+            yield order[starts[groups, None] + np.where(valid, place, 0)], valid

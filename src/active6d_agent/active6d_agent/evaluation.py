@@ -1,0 +1,198 @@
+"""The paper's Table 1 on a bank: every policy from the same starts, with paired intervals and bounds beside them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from active6d_agent.lookup import BankLookup
+from active6d_agent.oracle import search_views
+from active6d_agent.policy import Observation, Policy, create_policy
+
+BOUNDS = ("oracle", "all-views")
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeResults:
+    """What E episodes of one policy ended with.
+
+    Attributes:
+        detection_rate: (E,) fraction of the objects.
+        e_add_mm: (E,) mean over the objects, 50 mm for the missed.
+        distance_m: (E,) along the hemisphere.
+        views: (E, T + 1) views taken, -1 after an early stop.
+    """
+
+    detection_rate: np.ndarray
+    e_add_mm: np.ndarray
+    distance_m: np.ndarray
+    views: np.ndarray
+
+
+def all_starts(lookup: BankLookup, sample: int | None = None, seed: int = 0) -> np.ndarray:
+    """(E, 2) scenes and first views: every pair, or ``sample`` of them drawn without replacement."""
+    scenes, views = len(lookup.bank.scenes), len(lookup.sphere)
+    pairs = np.stack(np.unravel_index(np.arange(scenes * views), (scenes, views)), axis=1)
+    if sample is None or sample >= len(pairs):
+        return pairs
+    return pairs[np.sort(np.random.default_rng(seed).choice(len(pairs), sample, replace=False))]
+
+
+def run_policy(
+    lookup: BankLookup,
+    make_policy: Callable[[int], Policy],
+    starts: np.ndarray,
+    steps: int,
+    *,
+    seed: int = 0,
+    allowed: np.ndarray | None = None,
+    metres: float = np.inf,
+) -> EpisodeResults:
+    """Run a policy from every start, all episodes side by side.
+
+    Args:
+        lookup: of the bank.
+        make_policy: index of a scene to the policy for it.
+        starts: (E, 2) scenes and first views.
+        steps: moves T.
+        seed: each episode's randomness follows from it and its start.
+        allowed: (M,) bool, views in reach, all when None.
+        metres: budget of each episode.
+    """
+    allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
+    scene = starts[:, 0]
+    views = np.full((len(starts), steps + 1), -1)
+    views[:, 0] = starts[:, 1]
+    policies = [make_policy(index) for index in scene]
+    for policy, start in zip(policies, starts.tolist(), strict=True):
+        policy.reset(np.random.default_rng([seed, *start]))
+    running = np.arange(len(starts))
+    for step in range(steps):
+        if not len(running):
+            break
+        current = views[running, step]
+        fused = lookup.fuse(scene[running], views[running], current)
+        described = lookup.describe(fused, scene[running], current)
+        for episode, objects in zip(running, described, strict=True):
+            positions = lookup.sphere.positions[views[episode, : step + 1]]
+            left = metres - lookup.sphere.path_length(positions)
+            observation = Observation(objects, positions, lookup.sphere, allowed, steps - step, left)
+            decision = policies[episode].decide(observation)
+            views[episode, step + 1] = -1 if decision.stop else decision.view
+        running = running[views[running, step + 1] >= 0]
+    return measure(lookup, scene, views)
+
+
+def measure(lookup: BankLookup, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
+    """Score (E, v) views, -1 padding, taken in order."""
+    last = np.take_along_axis(views, (views >= 0).sum(axis=1, keepdims=True) - 1, axis=1)[:, 0]
+    scores = lookup.evaluate(lookup.fuse(scene, views, last), scene)
+    positions = lookup.sphere.positions[views]
+    arcs = np.where(views[:, 1:] >= 0, lookup.sphere.arc(positions[:, :-1], positions[:, 1:]), 0.0)
+    return EpisodeResults(
+        detection_rate=np.array([score.detection_rate for score in scores]),
+        e_add_mm=np.array([score.mean_e_add_mm for score in scores]),
+        distance_m=arcs.sum(axis=1),
+        views=views,
+    )
+
+
+def run_named(
+    lookup: BankLookup, name: str, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict | None = None
+) -> EpisodeResults:
+    """Run a policy or a bound by name.
+
+    Args:
+        lookup: of the bank.
+        name: of a policy, or one of ``BOUNDS``: ``oracle`` is greedy with the truth at hand, ``all-views`` takes all.
+        starts: (E, 2) scenes and first views.
+        steps: moves T.
+        seed: of the policy's randomness.
+        parameters: of the policy.
+
+    Raises:
+        ValueError: no such policy.
+    """
+    scene = starts[:, 0]
+    if name == "oracle":
+        found = [search_views(lookup, int(index), int(view), steps) for index, view in starts]
+        return measure(lookup, scene, np.stack(found))
+    if name == "all-views":
+        everything = np.tile(np.arange(len(lookup.sphere)), (len(starts), 1))
+        return measure(lookup, scene, (everything + starts[:, 1:]) % len(lookup.sphere))
+
+    def make(index: int) -> Policy:
+        own = {"entropy": lookup.bank.scenes[index].entropy} if name == "entropy" else {}
+        return create_policy(name, lookup.model, **{**own, **(parameters or {})})
+
+    return run_policy(lookup, make, starts, steps, seed=seed)
+
+
+def bootstrap_interval(values: np.ndarray, rng: np.random.Generator, resamples: int = _RESAMPLES) -> list[float]:
+    """95 % interval of the mean of (E,) values by resampling episodes.
+
+    Of two policies from the same starts, give the differences: that pairs them.
+    """
+    counts = rng.multinomial(len(values), np.full(len(values), 1.0 / len(values)), size=resamples)
+    return np.quantile(counts @ values / len(values), [0.025, 0.975]).tolist()
+
+
+def evaluate(
+    lookup: BankLookup,
+    names: Sequence[str],
+    steps: int,
+    starts: np.ndarray,
+    *,
+    seed: int = 0,
+    parameters: dict[str, dict] | None = None,
+) -> Iterator[tuple[str, EpisodeResults]]:
+    """Run every policy from the same starts; yields each as it is done."""
+    for name in names:
+        yield name, run_named(lookup, name, starts, steps, seed=seed, parameters=(parameters or {}).get(name))
+
+
+def summarise(results: dict[str, EpisodeResults], object_name: str, steps: int, seed: int = 0) -> dict:
+    """The table: means with 95 % intervals, paired differences to every other policy, and the share of the gap closed.
+
+    Args:
+        results: of every policy, all from the same starts.
+        object_name: of the object.
+        steps: moves T.
+        seed: of the resampling.
+
+    Returns:
+        ``{"object", "steps", "episodes", "policies": {name: {...}}}``; ``gap_closed`` is None unless ``random`` and
+        ``oracle`` are among the results; ``against`` holds differences, positive where this policy's value is higher.
+    """
+    table = {}
+    for name, own in results.items():
+        row: dict = {"distance_m": float(own.distance_m.mean())}
+        for measured in ("detection_rate", "e_add_mm"):
+            values = getattr(own, measured)
+            row[measured] = float(values.mean())
+            row[f"{measured}_ci95"] = bootstrap_interval(values, np.random.default_rng(seed))
+        row["gap_closed"] = _gap_closed(results, own)
+        row["against"] = {
+            other: {
+                measured: _difference(getattr(own, measured) - getattr(theirs, measured), seed)
+                for measured in ("detection_rate", "e_add_mm", "distance_m")
+            }
+            for other, theirs in results.items()
+            if other != name
+        }
+        table[name] = row
+    episodes = len(next(iter(results.values())).detection_rate)
+    return {"object": object_name, "steps": steps, "episodes": episodes, "policies": table}
+
+
+def _difference(values: np.ndarray, seed: int) -> dict:
+    return {"mean": float(values.mean()), "ci95": bootstrap_interval(values, np.random.default_rng(seed))}
+
+
+def _gap_closed(results: dict[str, EpisodeResults], own: EpisodeResults) -> float | None:
+    """Share of the way from Random's detection rate to the greedy oracle's."""
+    if not {"random", "oracle"} <= results.keys():
+        return None
+    low, high = (results[name].detection_rate.mean() for name in ("random", "oracle"))
+    return float((own.detection_rate.mean() - low) / (high - low)) if high > low else None
