@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -12,7 +13,7 @@ from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View, backprojec
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform, rotation_angle, transform_points
 from active6d_perception.dense.gauge import Turn, gauge_of, turn_about_z
-from active6d_perception.dense.network import DIRECTION_BINS, HEADS, split
+from active6d_perception.dense.network import DIRECTION_BINS, HEADS, DenseNetwork, NetworkSize, fused, split
 from active6d_perception.dense.network_input import (
     CHANNELS,
     network_input,
@@ -154,6 +155,18 @@ def test_sphere_bins_are_even_and_keep_directions():
 def test_split_takes_every_channel_once():
     answer = np.arange(sum(HEADS.values()))[None]
     assert np.concatenate(list(split(answer).values()), axis=1).tolist() == answer.tolist()
+
+
+def test_fused_network_answers_alike():
+    torch.manual_seed(0)
+    network = DenseNetwork(NetworkSize((4, 6, 8, 10), 6)).train()
+    inputs = torch.randn(2, CHANNELS, 32, 48)
+    for _ in range(3):
+        network(inputs)  # fills the running means
+    merged = fused(network)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in merged.modules())
+    with torch.inference_mode():
+        assert torch.allclose(network.eval()(inputs), merged(inputs), atol=1e-4)
 
 
 def test_kabsch_agrees_with_scipy():

@@ -24,7 +24,7 @@ from active6d_sim.sensor import SensorNoise, apply
 #: Heaps to learn from are dropped from seeds from here on; those of stored scenes and of episodes are smaller.
 FIRST_SEED = 1_000_000
 
-_VIEWS_PER_LOOK = 4
+_VIEWS_PER_LOOK = 8  # a look costs as much as four views
 
 
 @dataclass(frozen=True, eq=False)

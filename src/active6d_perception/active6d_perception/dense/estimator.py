@@ -14,6 +14,7 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.dense.decoding import TURNS, DecodingParameters, Instances, decode
 from active6d_perception.dense.gauge import Turn, turn_about_z
+from active6d_perception.dense.network import fused
 from active6d_perception.dense.network_input import (
     OUTPUT_STRIDE,
     ReducedView,
@@ -97,7 +98,7 @@ class DenseEstimator:
         self.parameters = parameters or DenseParameters()
         self.stage_ms: dict[str, float] = {}
         self._trained = trained
-        self._network = trained.network.eval().to(memory_format=torch.channels_last)
+        self._network = fused(trained.network).to(memory_format=torch.channels_last)
         self._views = model_views(model)
         self._distance = SymmetricDistance(model)
         samples = model.surface[0]

@@ -1,9 +1,11 @@
 """The network: a small U-shaped convolutional net with one answer for every second input pixel each way."""
 
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import fuse_conv_bn_eval
 
 from active6d_perception.dense.network_input import CHANNELS
 
@@ -85,6 +87,15 @@ def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
     )
+
+
+def fused(network: DenseNetwork) -> DenseNetwork:
+    """A copy for inference, each normalisation merged into the convolution before it: the same answers, sooner."""
+    network = deepcopy(network).eval()
+    for module in list(network.modules()):
+        if isinstance(module, nn.Sequential) and len(module) > 1 and isinstance(module[1], nn.BatchNorm2d):
+            module[0], module[1] = fuse_conv_bn_eval(module[0], module[1]), nn.Identity()
+    return network
 
 
 def split(answer, axis: int = 1) -> dict:
