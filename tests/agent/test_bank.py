@@ -1,5 +1,6 @@
 """Banks: what is written is read, an interrupted build goes on, and damaged files are refused in one line."""
 
+import contextlib
 import functools
 import json
 
@@ -36,17 +37,31 @@ def test_a_bank_survives_the_disk(tmp_path):
 def test_building_goes_on_where_it_stopped(tmp_path):
     names, log, path = [f"mug/synthetic/{seed}" for seed in (4, 1, 2)], tmp_path / "log", tmp_path / "bank.npz"
     observe = functools.partial(observe_synthetic, log=str(log))
-    progress = build_bank(path, "mug", names, observe, workers=1)
-    assert next(progress) in names
+    progress = build_bank(path, "mug", names, observe, provenance={"noise": (1, 2)})
+    first = next(progress)
     progress.close()
+    looked_at = log.read_text().split()
+    assert first in looked_at
     assert not path.exists()
-    assert sorted(build_bank(path, "mug", names, observe, workers=1, provenance={"seed": 1})) == sorted(names)
+    assert sorted(build_bank(path, "mug", names, observe, provenance={"noise": (1, 2)})) == sorted(names)
     assert sorted(log.read_text().split()) == sorted(names), "no scene was looked at twice"
     bank = load_bank(path)
     assert [scene.name for scene in bank.scenes] == names
-    assert bank.provenance == {"seed": 1}
+    assert bank.provenance == {"noise": [1, 2]}
     assert_equal(bank.scenes[1], synthetic_scene("mug", 1, 3, SPHERE))
     assert list(tmp_path.glob("*.parts")) == []
+
+
+def test_scenes_made_otherwise_are_made_again(tmp_path):
+    name, path = "mug/synthetic/1", tmp_path / "bank.npz"
+    for noise in (1, 2):
+        log = tmp_path / f"log{noise}"
+        broken = ["mug/broken/x"] if noise == 1 else []
+        observe = functools.partial(observe_synthetic, log=str(log))
+        with contextlib.suppress(ValueError):
+            list(build_bank(path, "mug", [name, *broken], observe, provenance={"noise": noise}))
+        assert name in log.read_text()
+    assert load_bank(path).provenance == {"noise": 2}
 
 
 class PerfectEstimator:

@@ -10,6 +10,7 @@ from synthetic_bank import synthetic_bank
 
 from active6d_agent.environment import ENVIRONMENT_ID, MAX_OBJECTS, Active6DEnv, Active6DVectorEnv, RewardParameters
 from active6d_agent.lookup import BankLookup
+from active6d_agent.throughput import measure_steps_per_second
 from active6d_core.camera import DEFAULT_CAMERA
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import e_add, evaluate_scene
@@ -188,6 +189,11 @@ def test_equal_seeds_give_equal_episodes(lookup):
         rng = np.random.default_rng(0)
         rewards.append([env.step(rng.uniform(-1, 1, (3, 3)))[1] for _ in range(7)])
     np.testing.assert_array_equal(*rewards)
+
+
+def test_throughput_is_measured_over_all_processes(lookup, tmp_path):
+    lookup.bank.save(tmp_path / "bank.npz")
+    assert measure_steps_per_second(tmp_path / "bank.npz", workers=1, environments=64, seconds=0.3) > 500
 
 
 def test_bad_settings_are_named(lookup):

@@ -11,7 +11,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -135,46 +135,53 @@ def build_bank(
     """Observe all scenes and write the bank; yields each scene's name as it is done.
 
     Finished scenes are kept beside ``path`` until the bank is complete, so a run that was interrupted goes on where it
-    stopped.
+    stopped; scenes that were made with another ``provenance`` are made again.
 
     Args:
         path: of the ``.npz`` to write.
         object_name: of the object.
         scenes: their names, in the bank's order.
-        observe: name to what was seen; for several workers it must be picklable (a module's function, or a
-            ``functools.partial`` of one).
+        observe: name to what was seen; it must be picklable (a module's function, or a ``functools.partial`` of one).
         workers: processes.
-        provenance: what to remember with the bank: estimator, its parameters, noise, versions.
+        provenance: what the bank depends on and remembers: estimator, its parameters, noise, versions; JSON values.
         sphere: grid of the views, the default one when None.
     """
-    sphere = sphere or ViewSphere()
+    sphere, provenance = sphere or ViewSphere(), provenance or {}
     parts = path.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
     files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes}
-    missing = [name for name in scenes if not files[name].is_file()]
+    missing = [name for name in scenes if not _is_finished(files[name], provenance)]
     yield from (name for name in scenes if name not in missing)
     # Spawned, because a forked child inherits locks of threads that do not live on in it (Embree, BLAS).
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
     try:
         running = {
-            pool.submit(_observe_to_file, observe, name, files[name], object_name, sphere): name for name in missing
+            pool.submit(
+                _observe_to_file, observe, name, files[name], SceneBank(object_name, sphere, [], provenance)
+            ): name
+            for name in missing
         }
         for done in as_completed(running):
             done.result()
             yield running[done]
     finally:
         pool.shutdown(cancel_futures=True)
-    bank = SceneBank(object_name, sphere, [load_bank(files[name]).scenes[0] for name in scenes], provenance or {})
-    bank.save(path)
+    SceneBank(object_name, sphere, [load_bank(files[name]).scenes[0] for name in scenes], provenance).save(path)
     for file in files.values():
         file.unlink()
     parts.rmdir()
 
 
-def _observe_to_file(
-    observe: Callable[[str], BankScene], name: str, path: Path, object_name: str, sphere: ViewSphere
-) -> None:
-    SceneBank(object_name, sphere, [observe(name)], {}).save(path)
+def _is_finished(path: Path, provenance: dict) -> bool:
+    """Whether a scene's file is whole and was made the same way."""
+    try:
+        return load_bank(path).provenance == json.loads(json.dumps(provenance))
+    except ValueError:
+        return False
+
+
+def _observe_to_file(observe: Callable[[str], BankScene], name: str, path: Path, bank: "SceneBank") -> None:
+    replace(bank, scenes=[observe(name)]).save(path)
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,7 +79,7 @@ class BankLookup:
         self.nearest_object = np.concatenate(list(map(self._nearest_objects, bank.scenes, poses, errors)))
         self._rows_of_view = self._index_views(views)
         self._index_distances(poses)
-        self._projected = np.empty((len(self.sphere), len(table), 5), np.float32)
+        self._projected = np.zeros((len(self.sphere), len(table), 5), np.float32)
         self._is_projected = np.zeros((len(self.sphere), len(bank.scenes)), bool)
 
     def _sort(self, scene: BankScene) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -184,6 +184,11 @@ class BankLookup:
         features[seen, :4], features[seen, 4] = self.box[own], self.depth[own]
         features[~valid] = 0.0
         return features
+
+    def project_everything(self) -> None:
+        """Project all hypotheses into all views now, which otherwise happens as views are taken."""
+        for view, scene in np.argwhere(~self._is_projected):
+            self._project(view, scene)
 
     def _project(self, view: int, scene: int) -> None:
         rows = slice(self.first_row[scene], self.first_row[scene + 1])
