@@ -26,6 +26,10 @@ class PinholeCamera:
             raise ValueError(f"camera size must be positive, got {self.width}x{self.height}")
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() or self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"camera focal lengths must be positive and finite, got fx={self.fx} fy={self.fy}")
+        # numpy promotes float32 images by an np.float64 and not by a float: results must not depend on where the
+        # numbers came from.
+        for name in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, name, float(getattr(self, name)))
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal_degrees: float) -> "PinholeCamera":
