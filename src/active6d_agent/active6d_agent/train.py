@@ -235,19 +235,7 @@ def train_policy(
     """
     parameters, reward = parameters or TrainingParameters(), reward or RewardParameters()
     folder.mkdir(parents=True, exist_ok=True)
-    environment = BankVecEnv(Active6DVectorEnv(train, parameters.environments, steps=parameters.steps, reward=reward))
-    ppo = PPO(
-        PaperPolicy,
-        environment,
-        learning_rate=parameters.learning_rate,
-        n_steps=parameters.rollout,
-        batch_size=parameters.batch,
-        n_epochs=parameters.epochs,
-        gamma=parameters.gamma,
-        ent_coef=parameters.entropy,
-        seed=parameters.seed,
-        device="auto",
-    )
+    ppo = _make_ppo(train, parameters, reward)
     identity = {"parameters": asdict(parameters) | {"total": 0}, "reward": asdict(reward)}
     curve, best, begun = folder / "curve.jsonl", (-1.0, 0.0), time.perf_counter()
     if resume:
@@ -270,6 +258,21 @@ def train_policy(
             save_network(network, folder / "best.safetensors", {**identity, "validation": asdict(progress)})
         _checkpoint(ppo, folder, {**identity, "best": best, "seconds": progress.seconds})
         yield progress
+
+
+def _make_ppo(lookup: BankLookup, parameters: TrainingParameters, reward: RewardParameters) -> PPO:
+    environment = BankVecEnv(Active6DVectorEnv(lookup, parameters.environments, steps=parameters.steps, reward=reward))
+    return PPO(
+        PaperPolicy,
+        environment,
+        learning_rate=parameters.learning_rate,
+        n_steps=parameters.rollout,
+        batch_size=parameters.batch,
+        n_epochs=parameters.epochs,
+        gamma=parameters.gamma,
+        ent_coef=parameters.entropy,
+        seed=parameters.seed,
+    )
 
 
 def validate(network: AttentionNetwork, lookup: BankLookup, steps: int) -> tuple[float, float, float]:
