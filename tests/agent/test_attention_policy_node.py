@@ -4,10 +4,15 @@ import array
 
 import numpy as np
 import pytest
+import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
+from synthetic_bank import synthetic_bank
 
+from active6d_agent.attention import AttentionNetwork, save_network
+from active6d_agent.environment import Active6DEnv
+from active6d_agent.lookup import BankLookup
 from active6d_agent.nodes.attention_policy import AttentionPolicyNode
 from active6d_core.conversions import (
     attention_from_cloud,
@@ -228,6 +233,30 @@ def test_an_empty_scene_still_moves(episode, make_objects):
     played.objects = make_objects()
     assert len(played.run(0)) == 3
     assert all(cloud.width == 0 for cloud in played.attention)
+
+
+def test_the_node_chooses_what_the_environment_would(episode, tmp_path):
+    """The paper's network, once behind topics and once on a bank: the same views and the same attended objects."""
+    torch.manual_seed(0)
+    network, lookup = AttentionNetwork().eval(), BankLookup(synthetic_bank("mug", scenes=1))
+    save_network(network, tmp_path / "weights.safetensors")
+    parameters = f"{{weights: {tmp_path / 'weights.safetensors'}}}"
+    played = episode(policy="attention", policy_parameters=parameters, steps=3)
+    env = Active6DEnv(lookup, steps=5)
+    observation, info = env.reset(options={"scene": 0, "view": 21})
+    views = [info["view"]]
+    for step in range(3):
+        played.objects = lookup.objects(0, views)
+        played.view(views[-1])
+        played.graph.spin_until(lambda step=step: len(played.goals) == len(played.attention) == step + 1)
+        with torch.inference_mode():
+            mean, weight, index = network({name: torch.from_numpy(value[None]) for name, value in observation.items()})
+        observation, _, _, _, info = env.step(np.append(mean[0].clamp(-1, 1).numpy(), index[0]))
+        views.append(info["view"])
+        published, attended = attention_from_cloud(played.attention[-1], "world")
+        assert attended == index[0]
+        np.testing.assert_allclose(published, weight[0, : len(published)], atol=1e-5)
+    assert played.goal_views() == views[1:]
 
 
 @pytest.mark.parametrize(
