@@ -48,7 +48,7 @@ def test_all_baselines_are_listed_and_made(model):
         ("random", {"azimuth_std_degrees": -1.0}, "policy 'random': .*not negative"),
         ("random", {"azimuth_std_degrees": "wide"}, "policy 'random'"),
         ("unidirectional", {"elevation_degrees": 95}, "elevation_degrees is 95, must be between 0 and 90"),
-        ("lowest-score", {"sight_weight": -1}, "sight_weight is -1"),
+        ("lowest-score", {"sight_weight": -1}, "weights must be finite and not negative"),
         ("entropy", {}, "policy 'entropy': .*entropy"),
         ("entropy", {"entropy": [np.nan]}, "finite"),
     ],
@@ -183,10 +183,28 @@ def test_lowest_score_goes_where_the_least_certain_object_is_in_sight(model, obs
     assert decision.attention[0] == decision.attention.max()
     assert decision.attention.sum() == pytest.approx(1.0)
     assert baselines.line_of_sight(objects.T_world_object[:, :3, 3], 0, decision.position[None], 0.1)[0] > 0.9
-    alone = make_objects([weak], [0.2])
-    nearest = policy.decide(observe([50], objects=alone)).view
-    distances = np.linalg.norm(SPHERE.positions - weak, axis=1)
-    assert distances[nearest] == pytest.approx(distances.min())
+
+
+def test_lowest_score_weighs_height_novelty_sight_and_motion(model, observe, make_objects):
+    """The documented sum, written with angles and loops."""
+    rng = np.random.default_rng(0)
+    objects = make_objects(rng.uniform(-0.1, 0.1, (5, 3)), [0.8, 0.7, 0.4, 0.9, 0.6])
+    taken = [12, 55, 71]
+    centre = objects.T_world_object[2, :3, 3]
+    sight = baselines.line_of_sight(objects.T_world_object[:, :3, 3], 2, SPHERE.positions, model.diameter)
+
+    def angle(a, b):
+        return np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+
+    worth = np.full(100, -np.inf)
+    for view in np.setdiff1d(np.arange(100), taken):
+        ray = SPHERE.positions[view] - centre
+        novelty = min(1.0, min(angle(ray, SPHERE.positions[old] - centre) for old in taken) / (np.pi / 2))
+        motion = angle(SPHERE.positions[view], SPHERE.positions[71]) / np.pi
+        worth[view] = np.sin(np.pi / 2 - angle(ray, np.array([0, 0, 1.0]))) + 2 * novelty + 3 * sight[view] - 4 * motion
+    weights = {"novelty_weight": 2, "sight_weight": 3, "motion_weight": 4}
+    policy = create_policy("lowest-score", model, **weights)
+    assert policy.decide(observe(taken, objects=objects)).view == worth.argmax()
 
 
 def test_line_of_sight_of_a_ball_behind_another():

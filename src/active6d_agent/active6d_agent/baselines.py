@@ -115,41 +115,55 @@ class MaxDistancePolicy:
 
 @register_policy("lowest-score")
 class LowestScorePolicy:
-    """Attend to the object with the lowest verification score and move to where it is seen best.
+    """Attend to the object with the lowest verification score and move to where it should be seen best.
 
-    A view is the better, the closer it is to the object (the paper's second reward term) and the freer its line of
-    sight past the other objects, each taken for a ball. Without any object it does as ``max-distance``.
+    A view is worth the sine of its elevation seen from the object (walls and objects that nobody has seen yet hide
+    things from the side), plus how new its direction is to the object (a quarter turn from all earlier ones is new),
+    plus how free the line of sight is past the known objects, each taken for a ball; less the way there. Without any
+    object it does as ``max-distance``.
 
     Args:
         model: its diameter is the size of the balls.
-        sight_weight: worth of a free line of sight against one sphere radius of closeness.
+        novelty_weight: of the new direction.
+        sight_weight: of the free line of sight.
+        motion_weight: of the arc to the view over half the sphere's circumference.
 
     Raises:
-        ValueError: the weight is negative.
+        ValueError: a weight is negative or not finite.
     """
 
-    def __init__(self, model: ObjectModel, sight_weight: float = 1.0) -> None:
-        if not sight_weight >= 0:
-            raise ValueError(f"sight_weight is {sight_weight}, must not be negative")
+    def __init__(
+        self,
+        model: ObjectModel,
+        novelty_weight: float = 1.0,
+        sight_weight: float = 0.5,
+        motion_weight: float = 0.5,
+    ) -> None:
+        self._weights = (novelty_weight, sight_weight, motion_weight)
+        if not all(0 <= weight < np.inf for weight in self._weights):
+            raise ValueError(f"weights must be finite and not negative, got {self._weights}")
         self._diameter = model.diameter
-        self._sight_weight = sight_weight
         self._explore = MaxDistancePolicy(model)
 
     def reset(self, rng: np.random.Generator) -> None:
         """Nothing is random here."""
 
     def decide(self, observation: Observation) -> Decision:
-        """The view that shows the least certain object best."""
-        objects = observation.objects
+        """The view that should show the least certain object best."""
+        objects, sphere = observation.objects, observation.sphere
         if not len(objects):
             return self._explore.decide(observation)
         attended = int(np.argmin(objects.verification))
         centres = objects.T_world_object[:, :3, 3]
-        views = observation.sphere.positions
-        closeness = -np.linalg.norm(views - centres[attended], axis=1) / observation.sphere.radius
-        sight = line_of_sight(centres, attended, views, self._diameter)
+        rays = _directions(centres[attended], sphere.positions)
+        turned = np.arccos(np.clip(rays @ _directions(centres[attended], observation.positions).T, -1.0, 1.0))
+        novelty = np.minimum(turned.min(axis=1) / (np.pi / 2), 1.0)
+        sight = line_of_sight(centres, attended, sphere.positions, self._diameter)
+        motion = sphere.arc(sphere.positions, observation.positions[-1]) / (np.pi * sphere.radius)
+        for_novelty, for_sight, for_motion = self._weights
+        value = rays[:, 2] + for_novelty * novelty + for_sight * sight - for_motion * motion
         attention = softmax((1.0 - objects.verification) / _ATTENTION_TEMPERATURE)
-        return _best_candidate(observation, closeness + self._sight_weight * sight, attention, attended)
+        return _best_candidate(observation, value, attention, attended)
 
 
 @register_policy("single-view")
@@ -211,14 +225,19 @@ def line_of_sight(centres: np.ndarray, index: int, views: np.ndarray, diameter: 
         views: (M, 3) camera positions.
         diameter: of an object.
     """
-    rays = views - centres[index]
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = _directions(centres[index], views)
     others = centres - centres[index]
     others = others[np.linalg.norm(others, axis=1) > _SAME_OBJECT * diameter]
     along = rays @ others.T
     beside = np.sqrt(np.maximum((others**2).sum(axis=1) - along**2, 0.0))
     hidden = np.where(along > 0, np.clip(1.0 - beside / diameter, 0.0, 1.0), 0.0)
     return np.prod(1.0 - hidden, axis=1)
+
+
+def _directions(origin: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """(m, 3) unit vectors from (3,) ``origin`` to (m, 3) ``targets``."""
+    rays = targets - origin
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 def _nearest_candidate(observation: Observation, goal: np.ndarray) -> Decision:
