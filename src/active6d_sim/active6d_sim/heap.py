@@ -3,16 +3,14 @@
 import hashlib
 import os
 import tempfile
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import pybullet
-from pybullet_utils.bullet_client import BulletClient
 from scipy.spatial.transform import Rotation
 
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import transform_from_quaternion
+from active6d_sim.bullet import BulletClient, connect, decompose, pybullet
 from active6d_sim.renderer import visible_fractions
 from active6d_sim.scene import Bin, Scene
 
@@ -22,6 +20,8 @@ VISIBILITY_THRESHOLD = 0.1
 _STEPS_PER_SECOND = 240
 _SECONDS_BETWEEN_DROPS = 0.25
 _MASS = 0.2
+#: What has fallen out of the bin after the first round is dropped once more.
+_ROUNDS = 2
 
 
 def drop_heap(
@@ -30,7 +30,7 @@ def drop_heap(
     """Drop ``count`` instances in random poses into ``bin`` and let them come to rest.
 
     While they fall, guides above the bin's walls keep them in; then the guides go, and what falls out of the bin is
-    removed. The same seed gives the same scene.
+    removed and dropped once more. The same seed gives the same scene.
 
     Args:
         model: the object; its mesh's origin is its centre of mass.
@@ -56,41 +56,50 @@ def drop_heap(
 
 
 def _simulate(model: ObjectModel, bin: Bin, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(k, 4, 4) poses of the objects that rest in the bin, k <= count."""
-    client = BulletClient(connection_mode=pybullet.DIRECT)
+    """(k, 4, 4) poses of the objects that rest in the bin; k is ``count`` unless some fall out twice."""
+    client = connect()
     try:
         client.setGravity(0, 0, -9.81)
         client.setPhysicsEngineParameter(
-            fixedTimeStep=1 / _STEPS_PER_SECOND, numSolverIterations=100, deterministicOverlappingPairs=1
+            fixedTimeStep=1 / _STEPS_PER_SECOND,
+            numSolverIterations=50,
+            contactBreakingThreshold=0.002,
+            erp=0.1,
+            contactERP=0.1,
+            deterministicOverlappingPairs=1,
         )
-        _add_bin(client, bin)
-        guides = _add_walls(client, bin, bottom=bin.wall_height, top=bin.wall_height + 2.0)
-        bodies = _drop(client, model, bin, count, rng)
-        _settle(client, bodies)
-        for guide in guides:
-            client.removeBody(guide)
-        _settle(client, bodies)
-        kept = [body for body in bodies if _is_inside(client, body, bin)]
-        for body in set(bodies) - set(kept):
-            client.removeBody(body)
-        _settle(client, kept)
-        poses = [client.getBasePositionAndOrientation(body) for body in kept if _is_inside(client, body, bin)]
+        table = _add_bin(client, bin)
+        bodies: list[int] = []
+        for _ in range(_ROUNDS):
+            guides = _add_walls(client, bin, bottom=bin.wall_height, top=bin.wall_height + 2.0)
+            bodies += _drop(client, model, bin, count - len(bodies), bodies, rng)
+            _settle(client, bodies)
+            for guide in guides:
+                client.removeBody(guide)
+            _settle(client, bodies)
+            bodies = _remove_fallen(client, bodies, table)
+            if len(bodies) == count:
+                break
+            _settle(client, bodies)
+        poses = [client.getBasePositionAndOrientation(body) for body in _remove_fallen(client, bodies, table)]
     finally:
         client.disconnect()
     positions, quaternions = np.array([p for p, _ in poses]), np.array([q for _, q in poses])
     return transform_from_quaternion(quaternions.reshape(-1, 4), positions.reshape(-1, 3))
 
 
-def _drop(client: BulletClient, model: ObjectModel, bin: Bin, count: int, rng: np.random.Generator) -> list[int]:
-    """Release the instances one after another just above the heap, so that none arrives fast."""
+def _drop(
+    client: BulletClient, model: ObjectModel, bin: Bin, count: int, present: list[int], rng: np.random.Generator
+) -> list[int]:
+    """Release ``count`` instances one after another just above those ``present``, so that none arrives fast."""
     shape = client.createCollisionShape(pybullet.GEOM_MESH, fileName=str(collision_file(model)))
     reach = np.maximum(np.array([bin.inner_width, bin.inner_depth]) / 2 - model.diameter / 2, 0.0)
     bodies: list[int] = []
     for _ in range(count):
-        tops = [client.getAABB(body)[1][2] for body in bodies]
+        tops = [client.getAABB(body)[1][2] for body in present + bodies]
         height = max([bin.wall_height, *tops]) + 0.6 * model.diameter
         body = client.createMultiBody(
-            _MASS, shape, basePosition=[*rng.uniform(-reach, reach), height], baseOrientation=Rotation.random(None, rng).as_quat()
+            _MASS, shape, basePosition=[*rng.uniform(-reach, reach), height], baseOrientation=Rotation.random(rng=rng).as_quat()
         )
         client.changeDynamics(
             body, -1, lateralFriction=0.5, rollingFriction=2e-4, spinningFriction=2e-4, restitution=0.05, angularDamping=0.1
@@ -101,11 +110,11 @@ def _drop(client: BulletClient, model: ObjectModel, bin: Bin, count: int, rng: n
     return bodies
 
 
-def _settle(client: BulletClient, bodies: list[int], seconds: float = 6.0) -> None:
+def _settle(client: BulletClient, bodies: list[int], seconds: float = 4.0) -> None:
     """Step until nothing has moved for a quarter of a second; damping grows, so that rolling objects stop as well."""
     block = _STEPS_PER_SECOND // 8
     still = 0
-    for damping in np.linspace(0.1, 0.99, round(seconds * 8)):
+    for damping in np.linspace(0.5, 0.99, round(seconds * 8)):
         for body in bodies:
             client.changeDynamics(body, -1, linearDamping=0.04 + 0.5 * damping, angularDamping=damping)
         for _ in range(block):
@@ -117,17 +126,21 @@ def _settle(client: BulletClient, bodies: list[int], seconds: float = 6.0) -> No
             return
 
 
-def _is_inside(client: BulletClient, body: int, bin: Bin) -> bool:
-    x, y, z = client.getBasePositionAndOrientation(body)[0]
-    return abs(x) < bin.inner_width / 2 and abs(y) < bin.inner_depth / 2 and z > 0
+def _remove_fallen(client: BulletClient, bodies: list[int], table: int) -> list[int]:
+    """Remove what touches the table, also while it leans on the bin; the others remain."""
+    kept = [body for body in bodies if not client.getContactPoints(body, table)]
+    for body in set(bodies) - set(kept):
+        client.removeBody(body)
+    return kept
 
 
-def _add_bin(client: BulletClient, bin: Bin) -> None:
+def _add_bin(client: BulletClient, bin: Bin) -> int:
+    """The tray on its table; returns the table."""
     outer = np.array([bin.inner_width, bin.inner_depth]) / 2 + bin.wall_thickness
     _add_box(client, (0, 0, -bin.wall_thickness / 2), (*outer, bin.wall_thickness / 2))
-    _add_box(client, (0, 0, -bin.wall_thickness - 0.5), (3.0, 3.0, 0.5))
     if bin.wall_height > 0:
         _add_walls(client, bin, bottom=0.0, top=bin.wall_height)
+    return _add_box(client, (0, 0, -bin.wall_thickness - 0.5), (3.0, 3.0, 0.5))
 
 
 def _add_walls(client: BulletClient, bin: Bin, bottom: float, top: float) -> list[int]:
@@ -162,20 +175,6 @@ def collision_file(model: ObjectModel) -> Path:
         with tempfile.TemporaryDirectory(dir=folder) as temporary:
             source, parts, log = (str(Path(temporary) / name) for name in ("mesh.obj", "parts.obj", "log.txt"))
             model.mesh.export(source)
-            with _silent_stdout():
-                pybullet.vhacd(source, parts, log, resolution=400_000, concavity=0.001, maxNumVerticesPerCH=48)
+            decompose(source, parts, log)
             os.replace(parts, path)  # atomic, so that processes may race
     return path
-
-
-@contextmanager
-def _silent_stdout():
-    """Silence C code that prints its progress."""
-    saved = os.dup(1)
-    with open(os.devnull, "w") as null:
-        os.dup2(null.fileno(), 1)
-    try:
-        yield
-    finally:
-        os.dup2(saved, 1)
-        os.close(saved)

@@ -18,6 +18,7 @@ from active6d_sim.appearance import TEXTURE_SIZE, Appearance
 from active6d_sim.scene import Bin, Scene
 
 _TABLE_HALF_WIDTH = 2.5
+_FADE_START = 0.8
 _TEXEL = 0.002
 _SHARP_EDGE = np.radians(40.0)
 _OCCLUSION_RAYS = 48
@@ -95,9 +96,10 @@ class SceneRenderer:
         self._caster = o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._caster.add_triangles(soup.vertices, soup.faces)
         openness = _ambient_openness(self._caster, soup, threads)
-        corners = np.concatenate([soup.normals, openness[:, None]], axis=1)[soup.faces]
         # One row more than there are faces: the row of rays that hit nothing.
-        self._corners = np.concatenate([corners, np.zeros((1, 3, 4), np.float32)]).astype(np.float32)
+        self._corner_normals = np.concatenate([soup.normals[soup.faces], np.zeros((1, 3, 3), np.float32)])
+        self._face_normals = np.ascontiguousarray(self._corner_normals[:, 0])
+        self._openness = np.concatenate([openness[soup.faces], np.zeros((1, 3), np.float32)])
         self._material = np.append(soup.material, np.int16(_BACKDROP))
         self._palette = self._make_palette(len(scene.T_world_all))
         self._textures = self._look.textures().reshape(2, -1)
@@ -111,21 +113,26 @@ class SceneRenderer:
         directions = pixel_rays(camera).reshape(-1, 3) @ R.T
         depth, face, uv = self._cast(eye, directions)
         hit = np.isfinite(depth)
-        material = self._material[face]
-        surface = self._interpolate(face, uv)
-        normals, openness = surface[:, :3], surface[:, 3]
-        normals /= np.maximum(np.sqrt(np.einsum("ij,ij->i", normals, normals)), 1e-6)[:, None]
-        normals *= np.where(np.einsum("ij,ij->i", normals, directions) > 0, np.float32(-1), np.float32(1))[:, None]
         points = eye + directions * np.where(hit, depth, 0)[:, None]
+        material = self._material[face]
+        on_object = np.flatnonzero(material >= _FIRST_INSTANCE)
+        normals, openness = self._interpolate(face, uv, on_object)
+        away = on_object[np.einsum("ij,ij->i", normals[on_object], directions[on_object]) > 0]
+        normals[away] *= -1
         color = self._shade(points, normals, openness, material, directions)
-        instance = np.maximum(material - _FIRST_INSTANCE, -1).astype(np.int16)
         shape = (camera.height, camera.width)
+        coordinates = None
+        if object_coordinates:
+            T = self._T_object_world[material[on_object] - _FIRST_INSTANCE]
+            coordinates = np.zeros_like(points)
+            coordinates[on_object] = np.einsum("pij,pj->pi", T[:, :3, :3], points[on_object]) + T[:, :3, 3]
+            coordinates = coordinates.reshape(*shape, 3)
         return RenderedView(
             color.reshape(*shape, 3),
-            np.where(hit, depth, np.nan).astype(np.float32).reshape(shape),
-            instance.reshape(shape),
+            np.where(hit, depth, np.float32(np.nan)).reshape(shape),
+            np.maximum(material - _FIRST_INSTANCE, -1).astype(np.int16).reshape(shape),
             (normals @ R).reshape(*shape, 3),
-            self._coordinates(points, instance).reshape(*shape, 3) if object_coordinates else None,
+            coordinates,
         )
 
     def instance_layers(self, T_world_camera: np.ndarray, camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
@@ -137,12 +144,14 @@ class SceneRenderer:
         count = len(self.scene.T_world_all)
         directions = pixel_rays(camera).reshape(-1, 3) @ np.asarray(T_world_camera[:3, :3], np.float32).T
         eye = np.asarray(T_world_camera[:3, 3], np.float32)
-        visible = self._material[self._cast(eye, directions)[1]].astype(int) - _FIRST_INSTANCE
+        first = self._material[self._cast(eye, directions)[1]]
+        # Nothing lies behind the table or the backdrop, so a ray that reaches them has met no object.
+        directions, first = directions[first >= _TRAY], first[first >= _TRAY].astype(int) - _FIRST_INSTANCE
         crossings = self._caster.list_intersections(_rays(eye, directions), nthreads=self._threads)
         crossed = self._material[crossings["primitive_ids"].numpy()].astype(int) - _FIRST_INSTANCE
         silhouettes = np.zeros((count, len(directions)), bool)
         silhouettes[crossed[crossed >= 0], crossings["ray_ids"].numpy()[crossed >= 0]] = True
-        return np.bincount(visible[visible >= 0], minlength=count), silhouettes.sum(axis=1)
+        return np.bincount(first[first >= 0], minlength=count), silhouettes.sum(axis=1)
 
     def _cast(self, eye: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Directions with z = 1 in the camera frame make the ray's parameter the depth. Misses get the extra face."""
@@ -150,11 +159,17 @@ class SceneRenderer:
         face = np.minimum(answer["primitive_ids"].numpy(), len(self._material) - 1)
         return answer["t_hit"].numpy(), face, answer["primitive_uvs"].numpy()
 
-    def _interpolate(self, face: np.ndarray, uv: np.ndarray) -> np.ndarray:
-        """(p, 4) normal and openness at barycentric ``uv`` of ``face``."""
-        corners = self._corners[face]
-        u, v = uv[:, :1], uv[:, 1:]
-        return corners[:, 0] * (1 - u - v) + corners[:, 1] * u + corners[:, 2] * v
+    def _interpolate(self, face: np.ndarray, uv: np.ndarray, on_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(p, 3) unit normals, smooth at the rays ``on_object``, and (p,) openness at barycentric ``uv`` of ``face``."""
+        weights = np.empty((len(face), 3), np.float32)
+        weights[:, 1:] = uv
+        weights[:, 0] = 1 - uv[:, 0] - uv[:, 1]
+        openness = np.einsum("ij,ij->i", weights, self._openness[face])
+        normals = self._face_normals[face]
+        smooth = np.einsum("ij,ijk->ik", weights[on_object], self._corner_normals[face[on_object]])
+        smooth /= np.maximum(np.sqrt(np.einsum("ij,ij->i", smooth, smooth)), 1e-6)[:, None]
+        normals[on_object] = smooth
+        return normals, openness
 
     def _shade(self, points, normals, openness, material, directions) -> np.ndarray:
         """(p, 3) uint8: ambient light dimmed in crevices, a shadowless fill light, and a key light with hard shadows."""
@@ -202,15 +217,10 @@ class SceneRenderer:
         backdrop = np.array(self._look.backdrop, np.float32)
         light[material == _BACKDROP] = backdrop
         table = np.flatnonzero(material == _TABLE)
-        fade = np.clip((np.hypot(points[table, 0], points[table, 1]) - 0.8) / (_TABLE_HALF_WIDTH - 0.8), 0, 1)[:, None]
-        light[table] += fade * (backdrop - light[table])
-
-    def _coordinates(self, points: np.ndarray, instance: np.ndarray) -> np.ndarray:
-        coordinates = np.zeros_like(points)
-        on_object = np.flatnonzero(instance >= 0)
-        T = self._T_object_world[instance[on_object]]
-        coordinates[on_object] = np.einsum("pij,pj->pi", T[:, :3, :3], points[on_object]) + T[:, :3, 3]
-        return coordinates
+        away = np.hypot(points[table, 0], points[table, 1])
+        far = away > _FADE_START
+        fade = np.minimum((away[far] - _FADE_START) / (_TABLE_HALF_WIDTH - _FADE_START), 1)[:, None]
+        light[table[far]] += fade * (backdrop - light[table[far]])
 
     def _make_palette(self, count: int) -> np.ndarray:
         fixed = np.array([self._look.backdrop, self._look.table_color, self._look.bin_color], np.float32)
@@ -222,12 +232,12 @@ def visible_fractions(
     model: ObjectModel | None = None,
     *,
     sphere: ViewSphere = ViewSphere(),
-    camera: PinholeCamera = DEFAULT_CAMERA.scaled(0.375),
+    camera: PinholeCamera = DEFAULT_CAMERA.scaled(0.25),
 ) -> np.ndarray:
     """(M, n + h) share of each object's silhouette that is visible from each view of ``sphere``.
 
     Visible pixels over the pixels of the object rendered alone by the same camera; 0 where it is outside the picture.
-    A small picture is enough: at 240x180 a mug covers about 600 pixels.
+    A small picture is enough: at 160x120 a mug covers about 250 pixels.
     """
     renderer = SceneRenderer(scene, model=model)
     layers = [renderer.instance_layers(sphere.pose(position), camera) for position in sphere.positions]

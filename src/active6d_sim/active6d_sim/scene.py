@@ -34,12 +34,11 @@ class Bin:
     def for_model(cls, model: ObjectModel) -> "Bin":
         """The square bin in which the model's usual number of instances lies one and a half to two layers deep.
 
-        The floor's area is that of the instances, each counted as the cube of its convex hull's volume, times 0.9: then
-        objects hide each other, but the heap neither towers nor leaves the default camera's picture (`docs/scenes.md`).
+        Its side is 0.625 diameters times the root of that number: then objects hide each other, but the heap neither
+        towers nor leaves the default camera's picture (measured in `docs/scenes.md`).
         """
-        footprint = float(model.mesh.convex_hull.volume) ** (2 / 3)
-        width = round(float(np.sqrt(0.9 * np.mean(model.instances) * footprint)), 2)
-        return cls(width, width, round(0.5 * model.diameter, 3))
+        width = round(0.625 * model.diameter * float(np.sqrt(np.mean(model.instances))), 2)
+        return cls(width, width, round(0.6 * model.diameter, 3))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,14 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
-from active6d_sim.heap import drop_heap
+from active6d_sim.heap import collision_file, drop_heap
 from active6d_sim.scene import Scene
 
 #: Scenes per split: 30 to train (of which 6 validate) and 10 to test, as in the paper.
@@ -83,8 +84,10 @@ def generate(object_name: str, folder: Path, *, splits: tuple[str, ...] = tuple(
                 missing.append((object_name, split, index, path))
     if not missing:
         return
+    collision_file(load_object(object_name))  # once, before every process makes its own
     (folder / object_name).mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(workers or os.cpu_count()) as pool:
+    # Forking a process whose ray caster has started its threads would hang.
+    with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn")) as pool:
         for done in as_completed([pool.submit(_store_scene, *job) for job in missing]):
             yield done.result()
 

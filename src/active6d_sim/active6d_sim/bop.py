@@ -1,0 +1,282 @@
+"""Scenes recorded in BOP's scene folder format (https://github.com/thodan/bop_toolkit, ``docs/bop_datasets_format.md``).
+
+A folder holds ``scene_camera.json`` (intrinsics and the camera's pose in the world), ``rgb/NNNNNN.png``,
+``depth/NNNNNN.png`` (16 bit, 0 without a return) and, optionally, ``scene_gt.json`` (object poses in the camera) and
+``scene_gt_info.json`` (visible fractions). On disk lengths are millimetres; here they are metres.
+"""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from active6d_core.camera import PinholeCamera, View
+from active6d_core.se3 import invert, make_transform, quaternion_from_transform, transform_from_quaternion
+
+CAMERA_FILE, TRUTH_FILE, VISIBILITY_FILE = "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
+#: Published datasets round rotations to about six digits; what is further from orthonormal was not meant as one.
+_ROTATION_TOLERANCE = 1e-3
+_DEEPEST = np.iinfo(np.uint16).max
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTruth:
+    """What is known of the n objects of one image.
+
+    Attributes:
+        object_id: (n,) int, BOP's number of the object's model.
+        T_camera_object: (n, 4, 4) poses in the optical frame, metres.
+        visible_fraction: (n,) share of the silhouette that is visible, NaN where the recording does not say.
+    """
+
+    object_id: np.ndarray
+    T_camera_object: np.ndarray
+    visible_fraction: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class BopScene:
+    """m recorded views of one scene; images are read when they are asked for.
+
+    Attributes:
+        folder: where it lies.
+        image_ids: (m) BOP's image numbers, ascending.
+        cameras: (m) intrinsics.
+        T_world_camera: (m, 4, 4) poses of the optical frame in the recording's world, metres.
+        depth_scale: (m) millimetres per step of the depth image.
+        truth: (m) ground truth, None where the recording has none.
+    """
+
+    folder: Path
+    image_ids: tuple[int, ...]
+    cameras: tuple[PinholeCamera, ...]
+    T_world_camera: np.ndarray
+    depth_scale: tuple[float, ...]
+    truth: tuple[ImageTruth, ...] | None
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "BopScene":
+        """Read and check everything but the pixels.
+
+        Raises:
+            ValueError: a file is missing or broken, or a key is missing or has a wrong value; the message names both.
+        """
+        folder = Path(folder)
+        path = folder / CAMERA_FILE
+        entries = _read_by_image(path)
+        if not entries:
+            raise ValueError(f"{path}: no image")
+        cameras, poses, scales = [], [], []
+        for image, entry in entries.items():
+            poses.append(invert(_read_pose(entry, "cam_R_w2c", "cam_t_w2c", path, image)))
+            if not np.linalg.norm(poses[-1][:3, 3]) > 1e-6:
+                raise ValueError(f"{path}: image {image}: cam_t_w2c puts the camera at the world's origin")
+            scale = float(_numbers(entry, "depth_scale", 1, path, image)[0])
+            if scale <= 0:
+                raise ValueError(f"{path}: image {image}: depth_scale must be positive, got {scale}")
+            scales.append(scale)
+            k = _numbers(entry, "cam_K", 9, path, image)
+            size = _size(_image_path(folder, "depth", image))
+            try:
+                cameras.append(PinholeCamera(*size, k[0], k[4], k[2], k[5]))
+            except ValueError as error:
+                raise ValueError(f"{path}: image {image}: cam_K: {error}") from error
+            color = _image_path(folder, "rgb", image)
+            if _size(color) != size:
+                raise ValueError(f"{color}: is {_size(color)} pixels, its depth image {size}")
+        truth = _read_truth(folder, tuple(entries)) if (folder / TRUTH_FILE).is_file() else None
+        return cls(folder, tuple(entries), tuple(cameras), np.array(poses), tuple(scales), truth)
+
+    def __len__(self) -> int:
+        return len(self.image_ids)
+
+    def view(self, index: int, stamp: int) -> View:
+        """The ``index``-th view, stamped with ``stamp`` nanoseconds.
+
+        Raises:
+            ValueError: an image is damaged or of another kind; the message names the file.
+        """
+        camera, image = self.cameras[index], self.image_ids[index]
+        color = _read_pixels(_image_path(self.folder, "rgb", image), camera)
+        depth_path = _image_path(self.folder, "depth", image)
+        steps = _read_pixels(depth_path, camera)
+        if color.ndim == 2:
+            color = np.repeat(color[..., None], 3, axis=2)
+        if steps.ndim != 2:
+            raise ValueError(f"{depth_path}: a depth image has one channel, this one {steps.shape[2]}")
+        depth = np.where(steps > 0, steps * (self.depth_scale[index] * 1e-3), np.nan).astype(np.float32)
+        return View(stamp, np.ascontiguousarray(color[..., :3], np.uint8), depth, camera, self.T_world_camera[index])
+
+    def nearest(self, position: np.ndarray) -> int:
+        """Index of the view whose direction from the world's origin is nearest to that of (3,) ``position``."""
+        positions = self.T_world_camera[:, :3, 3]
+        return int(np.argmax(positions @ position / np.linalg.norm(positions, axis=1)))
+
+    def T_world_object(self, index: int, object_id: int | None = None) -> np.ndarray:
+        """(n, 4, 4) ground truth of the ``index``-th view in the world, of one kind of object or of all.
+
+        Raises:
+            ValueError: the recording has no ground truth.
+        """
+        if self.truth is None:
+            raise ValueError(f"{self.folder / TRUTH_FILE}: no such file")
+        truth = self.truth[index]
+        chosen = np.full(len(truth.object_id), True) if object_id is None else truth.object_id == object_id
+        return self.T_world_camera[index] @ truth.T_camera_object[chosen]
+
+
+def write_bop_scene(
+    folder: str | Path,
+    views: Iterable[View],
+    T_world_object: np.ndarray,
+    object_id: int = 1,
+    *,
+    visible_fraction: np.ndarray | None = None,
+    depth_scale: float = 0.1,
+) -> None:
+    """Record views of (n, 4, 4) ``T_world_object`` as a scene folder, images numbered in order from 0.
+
+    Args:
+        folder: made if need be.
+        views: what the camera saw.
+        T_world_object: ground truth, the same in all views.
+        object_id: BOP's number of the objects' model, from 1.
+        visible_fraction: (m, n) for ``scene_gt_info.json``, which is left out when None.
+        depth_scale: millimetres per step; depth is rounded to it, and beyond 65535 steps there is no return.
+
+    Raises:
+        ValueError: ``folder`` holds a scene already, or an argument is out of range.
+    """
+    folder = Path(folder)
+    if (folder / CAMERA_FILE).exists():
+        raise ValueError(f"{folder / CAMERA_FILE} exists already; choose another folder")
+    if object_id < 1 or not 0 < depth_scale < np.inf:
+        raise ValueError(f"BOP counts objects from 1 and scales are positive, got {object_id} and {depth_scale}")
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    cameras, truth = {}, {}
+    for image, view in enumerate(views):
+        Image.fromarray(view.color).save(folder / "rgb" / f"{image:06d}.png")
+        steps = np.rint(np.nan_to_num(view.depth.astype(float), nan=0.0, posinf=0.0) * (1e3 / depth_scale))
+        Image.fromarray(np.where(steps <= _DEEPEST, steps, 0).astype(np.uint16)).save(folder / "depth" / f"{image:06d}.png")
+        T_camera_world = invert(view.T_world_camera)
+        cameras[image] = {
+            "cam_K": view.camera.matrix.ravel().tolist(),
+            "depth_scale": depth_scale,
+            **_pose_entry(T_camera_world, "cam_R_w2c", "cam_t_w2c"),
+        }
+        poses = T_camera_world @ T_world_object
+        truth[image] = [{**_pose_entry(T, "cam_R_m2c", "cam_t_m2c"), "obj_id": object_id} for T in poses]
+    if visible_fraction is not None:
+        expected = (len(cameras), len(T_world_object))
+        if np.shape(visible_fraction) != expected:
+            raise ValueError(f"visible_fraction has shape {np.shape(visible_fraction)}, expected {expected}")
+        rows = np.asarray(visible_fraction, float).tolist()
+        _write_by_image(folder / VISIBILITY_FILE, {i: [{"visib_fract": v} for v in row] for i, row in enumerate(rows)})
+    _write_by_image(folder / TRUTH_FILE, truth)
+    _write_by_image(folder / CAMERA_FILE, cameras)
+
+
+def _pose_entry(T: np.ndarray, rotation: str, translation: str) -> dict[str, list[float]]:
+    return {rotation: T[:3, :3].ravel().tolist(), translation: (1e3 * T[:3, 3]).tolist()}
+
+
+def _write_by_image(path: Path, entries: dict[int, Any]) -> None:
+    """One image a line, as BOP's own tools write it."""
+    lines = ",\n".join(f'  "{image}": {json.dumps(entry)}' for image, entry in entries.items())
+    path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+
+
+def _read_by_image(path: Path) -> dict[int, Any]:
+    """A file's entries by image number, ascending."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: no such file; a BOP scene folder needs it") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not a JSON file ({error})") from error
+    if not isinstance(content, dict) or not all(key.isascii() and key.isdecimal() for key in content):
+        raise ValueError(f"{path}: must map image numbers to entries")
+    return {int(key): content[key] for key in sorted(content, key=int)}
+
+
+def _read_truth(folder: Path, image_ids: tuple[int, ...]) -> tuple[ImageTruth, ...]:
+    path, visibility_path = folder / TRUTH_FILE, folder / VISIBILITY_FILE
+    by_image = _read_by_image(path)
+    visibility = _read_by_image(visibility_path) if visibility_path.is_file() else None
+    truth = []
+    for image in image_ids:
+        entries = _entries(by_image, path, image)
+        poses = [_read_pose(entry, "cam_R_m2c", "cam_t_m2c", path, image) for entry in entries]
+        kinds = [_numbers(entry, "obj_id", 1, path, image)[0] for entry in entries]
+        visible = np.full(len(entries), np.nan)
+        if visibility is not None:
+            known = _entries(visibility, visibility_path, image)
+            if len(known) != len(entries):
+                raise ValueError(f"{visibility_path}: image {image}: {len(known)} objects, {TRUTH_FILE} has {len(entries)}")
+            visible[:] = [_numbers(entry, "visib_fract", 1, visibility_path, image)[0] for entry in known]
+        truth.append(ImageTruth(np.array(kinds, int), np.array(poses).reshape(-1, 4, 4), visible))
+    return tuple(truth)
+
+
+def _entries(by_image: dict[int, Any], path: Path, image: int) -> list:
+    entries = by_image.get(image)
+    if not isinstance(entries, list):
+        raise ValueError(f"{path}: image {image}: no list of objects")
+    return entries
+
+
+def _numbers(entry: Any, key: str, count: int, path: Path, image: int) -> np.ndarray:
+    """(count,) finite numbers under ``key``."""
+    if not isinstance(entry, dict) or key not in entry:
+        raise ValueError(f"{path}: image {image}: no key {key}")
+    try:
+        values = np.array(entry[key], float).ravel()
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: image {image}: {key} must be {count} numbers ({error})") from error
+    if len(values) != count or not np.isfinite(values).all():
+        raise ValueError(f"{path}: image {image}: {key} must be {count} finite numbers, got {entry[key]}")
+    return values
+
+
+def _read_pose(entry: Any, rotation: str, translation: str, path: Path, image: int) -> np.ndarray:
+    """(4, 4) in metres; the rotation is made exactly orthonormal."""
+    R = _numbers(entry, rotation, 9, path, image).reshape(3, 3)
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        raise ValueError(f"{path}: image {image}: {rotation} is not a rotation")
+    metres = 1e-3 * _numbers(entry, translation, 3, path, image)
+    return transform_from_quaternion(quaternion_from_transform(make_transform(R, metres)), metres)
+
+
+def _image_path(folder: Path, kind: str, image: int) -> Path:
+    """The image's file; published datasets have colour as JPEG, too."""
+    png, jpg = (folder / kind / f"{image:06d}.{ending}" for ending in ("png", "jpg"))
+    return png if png.is_file() or not jpg.is_file() else jpg
+
+
+def _size(path: Path) -> tuple[int, int]:
+    """Width and height, from the file's header alone."""
+    try:
+        with Image.open(path) as picture:
+            return picture.size
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: no such file, but {CAMERA_FILE} lists it") from error
+    except (OSError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{path}: not an image ({error})") from error
+
+
+def _read_pixels(path: Path, camera: PinholeCamera) -> np.ndarray:
+    """(H, W) or (H, W, channels) of the camera's size."""
+    try:
+        with Image.open(path) as picture:
+            pixels = np.array(picture)
+    # Pillow's decoders raise many kinds on damaged files, SyntaxError among them.
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable image ({error})") from error
+    if pixels.shape[:2] != (camera.height, camera.width):
+        raise ValueError(f"{path}: is {pixels.shape[:2][::-1]} pixels, was {(camera.width, camera.height)}")
+    return pixels

@@ -1,0 +1,42 @@
+"""pybullet without what its C code prints: an import banner, a line per connection, and every step of V-HACD."""
+
+import ctypes
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_LIBC = ctypes.CDLL(None)
+
+
+@contextmanager
+def silence(*streams: int) -> Iterator[None]:
+    """Discard what C code writes to file descriptors (1 is standard output, 2 standard error) meanwhile."""
+    _LIBC.fflush(None)
+    saved = [os.dup(stream) for stream in streams]
+    with open(os.devnull, "w") as null:
+        for stream in streams:
+            os.dup2(null.fileno(), stream)
+    try:
+        yield
+    finally:
+        _LIBC.fflush(None)
+        for stream, copy in zip(streams, saved, strict=True):
+            os.dup2(copy, stream)
+            os.close(copy)
+
+
+with silence(1, 2):
+    import pybullet
+    from pybullet_utils.bullet_client import BulletClient
+
+
+def connect() -> BulletClient:
+    """A physics server of one's own, in this process and without a window."""
+    with silence(1):
+        return BulletClient(connection_mode=pybullet.DIRECT)
+
+
+def decompose(source: str, parts: str, log: str) -> None:
+    """Write the approximate convex decomposition (V-HACD) of the ``.obj`` file ``source`` to ``parts``, a group a part."""
+    with silence(1):
+        pybullet.vhacd(source, parts, log, resolution=400_000, concavity=0.001, maxNumVerticesPerCH=48)
