@@ -11,9 +11,9 @@ help:  ## this list
 setup:  ## make .venv ready (done by the others, too)
 	@scripts/setup.sh
 
-demo: setup  ## one episode on a heap of mugs: a bag and a report in bags/demo
+demo: setup  ## one episode on a heap of cups: a bag and a report in bags/demo
 	rm -rf $(DEMO)
-	$(BIN)/active6d episode --object mug --seed 7 --policy lowest-score --steps 5 --bag $(DEMO) --report $(DEMO)/report.html
+	$(BIN)/active6d episode --object coffee_cup --seed 7 --policy lowest-score --steps 5 --bag $(DEMO) --report $(DEMO)/report.html
 	@echo "Open $(DEMO)/report.html in a browser; the bag beside it opens in Foxglove, ros2 bag and rosbags."
 
 test: setup  ## all tests
