@@ -16,7 +16,7 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     python_requires=">=3.11",
-    install_requires=["active6d_core", "numpy", "open3d-cpu", "pybullet", "scipy", "trimesh"],
+    install_requires=["active6d_core", "numpy", "open3d-cpu", "pillow", "pybullet", "scipy", "trimesh"],
     entry_points={
         "console_scripts": [
             "camera_simulator = active6d_sim.nodes.camera_simulator:main",

@@ -1,4 +1,4 @@
-"""Scenes recorded in BOP's scene folder format (https://github.com/thodan/bop_toolkit, ``docs/bop_datasets_format.md``).
+"""Scenes recorded in the folder format of BOP (``docs/bop_datasets_format.md`` of https://github.com/thodan/bop_toolkit).
 
 A folder holds ``scene_camera.json`` (intrinsics and the camera's pose in the world), ``rgb/NNNNNN.png``,
 ``depth/NNNNNN.png`` (16 bit, 0 without a return) and, optionally, ``scene_gt.json`` (object poses in the camera) and
@@ -162,7 +162,8 @@ def write_bop_scene(
     for image, view in enumerate(views):
         Image.fromarray(view.color).save(folder / "rgb" / f"{image:06d}.png")
         steps = np.rint(np.nan_to_num(view.depth.astype(float), nan=0.0, posinf=0.0) * (1e3 / depth_scale))
-        Image.fromarray(np.where(steps <= _DEEPEST, steps, 0).astype(np.uint16)).save(folder / "depth" / f"{image:06d}.png")
+        steps = np.where(steps <= _DEEPEST, steps, 0).astype(np.uint16)
+        Image.fromarray(steps).save(folder / "depth" / f"{image:06d}.png")
         T_camera_world = invert(view.T_world_camera)
         cameras[image] = {
             "cam_K": view.camera.matrix.ravel().tolist(),
@@ -217,7 +218,9 @@ def _read_truth(folder: Path, image_ids: tuple[int, ...]) -> tuple[ImageTruth, .
         if visibility is not None:
             known = _entries(visibility, visibility_path, image)
             if len(known) != len(entries):
-                raise ValueError(f"{visibility_path}: image {image}: {len(known)} objects, {TRUTH_FILE} has {len(entries)}")
+                raise ValueError(
+                    f"{visibility_path}: image {image}: {len(known)} objects, {TRUTH_FILE} has {len(entries)}"
+                )
             visible[:] = [_numbers(entry, "visib_fract", 1, visibility_path, image)[0] for entry in known]
         truth.append(ImageTruth(np.array(kinds, int), np.array(poses).reshape(-1, 4, 4), visible))
     return tuple(truth)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from active6d_core.object_model import load_object
+from active6d_core.object_model import list_objects, load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.heap import collision_file, drop_heap
 from active6d_sim.scene import Scene
@@ -38,17 +38,22 @@ def load_scene(object_name: str, split: str, index: int) -> Scene:
     """A stored scene.
 
     Raises:
-        ValueError: there is no such scene; the message says which there are.
+        ValueError: there is no such object or scene, the message says which there are; or its file is damaged.
     """
     if split not in SPLITS or not 0 <= index < SPLITS[split]:
         known = ", ".join(f"{name}/0..{count - 1}" for name, count in SPLITS.items())
         raise ValueError(f"no scene '{object_name}/{split}/{index}'; there are {object_name}/ {known}")
+    if object_name not in list_objects():
+        raise ValueError(f"unknown object '{object_name}'; known: {', '.join(list_objects())}")
     path = scene_path(object_name, split, index)
     if not path.is_file():
         raise ValueError(
             f"no stored scenes of '{object_name}'; make them with: active6d scenes generate --object {object_name}"
         )
-    return Scene.load(path)
+    scene = Scene.load(path)
+    if scene.object_name != object_name:
+        raise ValueError(f"{path}: is a scene of '{scene.object_name}', not of '{object_name}'")
+    return scene
 
 
 def find_scene(object_name: str, name: str, seed: int) -> Scene:
@@ -59,7 +64,7 @@ def find_scene(object_name: str, name: str, seed: int) -> Scene:
     """
     if not name:
         if not 0 <= seed < FIRST_STORED_SEED:
-            raise ValueError(f"seed must be between 0 and {FIRST_STORED_SEED - 1}, got {seed}: stored scenes use the others")
+            raise ValueError(f"seed must be within 0 and {FIRST_STORED_SEED - 1} (others are stored), got {seed}")
         return drop_heap(load_object(object_name), seed)
     parts = name.removeprefix(f"{object_name}/").split("/")
     if len(parts) != 2 or not parts[1].isdecimal():
@@ -67,7 +72,9 @@ def find_scene(object_name: str, name: str, seed: int) -> Scene:
     return load_scene(object_name, parts[0], int(parts[1]))
 
 
-def generate(object_name: str, folder: Path, *, splits: tuple[str, ...] = tuple(SPLITS), workers: int | None = None) -> Iterator[Path]:
+def generate(
+    object_name: str, folder: Path, *, splits: tuple[str, ...] = tuple(SPLITS), workers: int | None = None
+) -> Iterator[Path]:
     """Drop and store every scene of an object that is not there yet, on all cores; yields each file as it is done.
 
     Raises:
@@ -100,7 +107,9 @@ def _store_scene(object_name: str, split: str, index: int, path: Path) -> Path:
     return path
 
 
-def density_report(scenes: list[Scene], rng: np.random.Generator, *, moves: int = 5, starts: int = 20) -> dict[str, float]:
+def density_report(
+    scenes: list[Scene], rng: np.random.Generator, *, moves: int = 5, starts: int = 20
+) -> dict[str, float]:
     """How much the choice of views matters: shares of objects that at least one taken view shows at least half of.
 
     Args:
@@ -116,11 +125,12 @@ def density_report(scenes: list[Scene], rng: np.random.Generator, *, moves: int 
     sphere = ViewSphere()
     shares: dict[str, list[float]] = {name: [] for name in ("one_view", "random", "revolution", "oracle", "all_views")}
     ring = np.flatnonzero(np.isclose(np.degrees(sphere.angles(sphere.positions)[:, 1]), 45.0))
+    spaced = np.round(np.arange(moves + 1) * len(ring) / (moves + 1)).astype(int)
     for scene in scenes:
         seen = scene.visible_fraction >= 0.5
         for _ in range(starts):
             views = rng.choice(len(sphere), moves + 1, replace=False)
-            around = ring[(rng.integers(len(ring)) + np.round(np.arange(moves + 1) * len(ring) / (moves + 1)).astype(int)) % len(ring)]
+            around = ring[(rng.integers(len(ring)) + spaced) % len(ring)]
             shares["one_view"].append(seen[views[0]].mean())
             shares["random"].append(seen[views].any(axis=0).mean())
             shares["revolution"].append(seen[around].any(axis=0).mean())

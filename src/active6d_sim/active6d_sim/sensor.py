@@ -55,7 +55,10 @@ class SensorNoise:
             raise ValueError("sensor noise: baseline, patch and grazing_width_degrees must be positive")
 
     def scaled(self, factor: float) -> "SensorNoise":
-        """The sensor with ``factor`` times the noise and losses; 0 is a perfect one."""
+        """The sensor with ``factor`` times the noise and losses of disparity, edges, speckle and colour.
+
+        What comes of geometry and rounding (jitter, grazing angle, quantum) stays; only 0, a perfect sensor, has none.
+        """
         if factor == 0:
             return SensorNoise.off()
         return replace(

@@ -53,7 +53,7 @@ def admit_goal(T_world_goal: np.ndarray, sphere: ViewSphere, *, snap: bool, tole
         (4, 4) ``T_world_camera``.
 
     Raises:
-        GoalError: the pose is not rigid, below the table, or off the hemisphere.
+        GoalError: the pose is not rigid, not above the table, or off the hemisphere.
     """
     if not is_rigid(T_world_goal):
         raise GoalError("view goal is not a rigid pose")
@@ -63,7 +63,8 @@ def admit_goal(T_world_goal: np.ndarray, sphere: ViewSphere, *, snap: bool, tole
     radius = float(np.linalg.norm(position))
     if abs(radius - sphere.radius) > tolerance:
         raise GoalError(
-            f"view goal is {radius:.3f} m from the bin's centre, more than {tolerance} m off the hemisphere of {sphere.radius} m"
+            f"view goal is {radius:.3f} m from the bin's centre, "
+            f"more than {tolerance} m off the hemisphere of {sphere.radius} m"
         )
     return sphere.pose(sphere.positions[sphere.nearest(position)]) if snap else np.array(T_world_goal, float)
 

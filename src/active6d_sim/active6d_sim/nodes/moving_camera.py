@@ -1,4 +1,4 @@
-"""What a simulated and a recorded camera share: a goal moves them, and every move is one view on the camera's topics."""
+"""What a simulated and a recorded camera share: a goal moves them, and every move is one view on their topics."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -37,7 +37,7 @@ class MovingCameraNode(GraphNode):
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
         self.object_name = self.declare("object", "mug", "name of the object that fills the bin")
-        self.seed = self.declare("seed", 0, "of everything that is drawn at random", minimum=0)
+        self.seed = self.declare("seed", 0, "of all that is drawn: a heap, its looks, noise, the first view", minimum=0)
         self.start_view = self.declare(
             "start_view", -1, "number of the view to start from, -1 draws it by seed", minimum=-1
         )
@@ -94,6 +94,11 @@ class MovingCameraNode(GraphNode):
 
     # Views
 
+    def check_start_view(self, views: int) -> None:
+        """Raise ValueError unless there is a view of the number to start from."""
+        if self.start_view >= views:
+            raise ValueError(f"{self.get_name()}: parameter 'start_view' is {self.start_view}, the last is {views - 1}")
+
     def begin(self) -> None:
         """Start an episode: announce it and publish its first view."""
         start = self.draw_start() if self.start_view < 0 else self.start_view
@@ -114,7 +119,8 @@ class MovingCameraNode(GraphNode):
             self._depth.publish(depth_to_image(view.depth, stamp, self.camera_frame))
 
     def _announce(self, start: int) -> None:
-        values = {"object": self.object_name, "scene": self.scene_name, "seed": str(self.seed), "start_view": str(start)}
+        values = {"object": self.object_name, "scene": self.scene_name}
+        values |= {"seed": str(self.seed), "start_view": str(start)}
         status = DiagnosticStatus(level=DiagnosticStatus.OK, name="episode", message=f"episode in {self.scene_name}")
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         self._start.publish(DiagnosticArray(header=make_header(self._stamp, self.world_frame), status=[status]))

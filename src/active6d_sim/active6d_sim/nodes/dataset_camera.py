@@ -1,0 +1,72 @@
+"""A camera that was there once: a goal moves it to the nearest view of a scene recorded in BOP's format."""
+
+from typing import Any
+
+import numpy as np
+
+from active6d_core.camera import View
+from active6d_core.conversions import MessageError
+from active6d_core.node import run_node
+from active6d_sim.bop import BopScene
+from active6d_sim.nodes.moving_camera import MovingCameraNode
+from active6d_sim.simulator import admit_goal
+
+
+class DatasetCameraNode(MovingCameraNode):
+    """A moving camera that knows only the recorded views; what it publishes is as recorded, its pose too.
+
+    Directions are from the recording's world origin, which should be the bin's centre with z up.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("dataset_camera", **options)
+        self._folder = self.declare("scene", "", "folder of the recorded scene: scene_camera.json, rgb/ and depth/")
+        self._object_id = self.declare(
+            "object_id", 0, "number of the object in the recorded ground truth, 0 for all of them", minimum=0
+        )
+
+    def setup(self) -> None:
+        """Read the recording's files, without its images."""
+        if not self._folder:
+            raise ValueError(f"{self.get_name()}: parameter 'scene' must name the folder of a recorded scene")
+        self._scene = BopScene.load(self._folder)
+        self.check_start_view(len(self._scene))
+
+    @property
+    def scene_name(self) -> str:
+        """The folder, as it was given."""
+        return self._folder
+
+    def draw_start(self) -> int:
+        """Any recorded view."""
+        return int(np.random.default_rng(self.seed).integers(len(self._scene)))
+
+    def start_pose(self, view: int) -> np.ndarray:
+        """Where the numbered image was taken, counting from 0."""
+        return self._scene.T_world_camera[view]
+
+    def truth(self, view: int) -> np.ndarray | None:
+        """What the recording says of that image's objects."""
+        return self._scene.T_world_object(view, self._object_id or None) if self._scene.truth is not None else None
+
+    def destination(self, T_world_goal: np.ndarray) -> np.ndarray:
+        """The recorded view nearest in direction to the goal."""
+        admitted = admit_goal(T_world_goal, self.sphere, snap=False, tolerance=self.tolerance)
+        return self._scene.T_world_camera[self._scene.nearest(admitted[:3, 3])]
+
+    def capture(self, T_world_camera: np.ndarray, stamp: int) -> View:
+        """The images that were recorded there."""
+        index = np.abs(self._scene.T_world_camera - T_world_camera).max(axis=(1, 2)).argmin()
+        try:
+            return self._scene.view(int(index), stamp)
+        except ValueError as error:
+            raise MessageError(str(error)) from error
+
+
+def main() -> None:
+    """Entry point of ``ros2 run active6d_sim dataset_camera``."""
+    run_node(DatasetCameraNode)
+
+
+if __name__ == "__main__":
+    main()
