@@ -37,6 +37,6 @@ def connect() -> BulletClient:
 
 
 def decompose(source: str, parts: str, log: str) -> None:
-    """Write the approximate convex decomposition (V-HACD) of the ``.obj`` file ``source`` to ``parts``, a group a part."""
+    """Write the convex parts (V-HACD) of the ``.obj`` file ``source`` to ``parts``, one group each."""
     with silence(1):
         pybullet.vhacd(source, parts, log, resolution=400_000, concavity=0.001, maxNumVerticesPerCH=48)

@@ -20,6 +20,7 @@ VISIBILITY_THRESHOLD = 0.1
 _STEPS_PER_SECOND = 240
 _SECONDS_BETWEEN_DROPS = 0.25
 _MASS = 0.2
+_CONTACT = {"lateralFriction": 0.5, "rollingFriction": 2e-4, "restitution": 0.05}
 #: What has fallen out of the bin after the first round is dropped once more.
 _ROUNDS = 2
 
@@ -49,10 +50,11 @@ def drop_heap(
         raise ValueError(f"a heap needs at least one object, got count={count}")
     bin = bin or Bin.for_model(model)
     T_world_all = _simulate(model, bin, count, rng)
-    everything = Scene(model.name, name or f"{model.name}/seed/{seed}", seed, T_world_all, bin, np.zeros((0, len(T_world_all))))
+    name = name or f"{model.name}/seed/{seed}"
+    everything = Scene(model.name, name, seed, T_world_all, bin, np.zeros((0, len(T_world_all))))
     fractions = visible_fractions(everything, model)
     seen = fractions.max(axis=0, initial=0.0) >= VISIBILITY_THRESHOLD
-    return Scene(model.name, everything.name, seed, T_world_all[seen], bin, fractions[:, seen], T_world_all[~seen])
+    return Scene(model.name, name, seed, T_world_all[seen], bin, fractions[:, seen], T_world_all[~seen])
 
 
 def _simulate(model: ObjectModel, bin: Bin, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -98,12 +100,9 @@ def _drop(
     for _ in range(count):
         tops = [client.getAABB(body)[1][2] for body in present + bodies]
         height = max([bin.wall_height, *tops]) + 0.6 * model.diameter
-        body = client.createMultiBody(
-            _MASS, shape, basePosition=[*rng.uniform(-reach, reach), height], baseOrientation=Rotation.random(rng=rng).as_quat()
-        )
-        client.changeDynamics(
-            body, -1, lateralFriction=0.5, rollingFriction=2e-4, spinningFriction=2e-4, restitution=0.05, angularDamping=0.1
-        )
+        position, quaternion = [*rng.uniform(-reach, reach), height], Rotation.random(rng=rng).as_quat()
+        body = client.createMultiBody(_MASS, shape, basePosition=position, baseOrientation=quaternion)
+        client.changeDynamics(body, -1, spinningFriction=2e-4, angularDamping=0.1, **_CONTACT)
         bodies.append(body)
         for _ in range(round(_SECONDS_BETWEEN_DROPS * _STEPS_PER_SECOND)):
             client.stepSimulation()
@@ -144,7 +143,7 @@ def _add_bin(client: BulletClient, bin: Bin) -> int:
 
 
 def _add_walls(client: BulletClient, bin: Bin, bottom: float, top: float) -> list[int]:
-    """Four walls around the bin's inside; physics needs them thicker than they look, so that nothing tunnels through."""
+    """Four walls around the bin's inside."""
     half_x, half_y, thick = bin.inner_width / 2, bin.inner_depth / 2, bin.wall_thickness / 2
     middle, half_z = (bottom + top) / 2, (top - bottom) / 2
     walls = []
@@ -157,7 +156,7 @@ def _add_walls(client: BulletClient, bin: Bin, bottom: float, top: float) -> lis
 def _add_box(client: BulletClient, centre: tuple, half_extents: tuple) -> int:
     shape = client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half_extents)
     body = client.createMultiBody(0, shape, basePosition=centre)
-    client.changeDynamics(body, -1, lateralFriction=0.5, rollingFriction=2e-4, restitution=0.05)
+    client.changeDynamics(body, -1, **_CONTACT)
     return body
 
 

@@ -160,7 +160,7 @@ class SceneRenderer:
         return answer["t_hit"].numpy(), face, answer["primitive_uvs"].numpy()
 
     def _interpolate(self, face: np.ndarray, uv: np.ndarray, on_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(p, 3) unit normals, smooth at the rays ``on_object``, and (p,) openness at barycentric ``uv`` of ``face``."""
+        """(p, 3) unit normals, smooth for the rays ``on_object``, and (p,) openness, at barycentric ``uv``."""
         weights = np.empty((len(face), 3), np.float32)
         weights[:, 1:] = uv
         weights[:, 0] = 1 - uv[:, 0] - uv[:, 1]
@@ -171,15 +171,22 @@ class SceneRenderer:
         normals[on_object] = smooth
         return normals, openness
 
-    def _shade(self, points, normals, openness, material, directions) -> np.ndarray:
-        """(p, 3) uint8: ambient light dimmed in crevices, a shadowless fill light, and a key light with hard shadows."""
+    def _shade(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        openness: np.ndarray,
+        material: np.ndarray,
+        directions: np.ndarray,
+    ) -> np.ndarray:
+        """(p, 3) uint8: ambient light dimmed in crevices, a shadowless fill light, a key light with hard shadows."""
         look = self._look
         key, fill = (_unit(direction) for direction in (look.key_direction, look.fill_direction))
         facing_key = normals @ key
         lit = np.flatnonzero((facing_key > 0) & (material != _BACKDROP))
         offset = points[lit] + 5e-4 * normals[lit]
-        shadowed = self._caster.test_occlusions(_rays(offset, np.broadcast_to(key, offset.shape)), nthreads=self._threads)
-        lit = lit[~shadowed.numpy()]
+        towards_key = _rays(offset, np.broadcast_to(key, offset.shape))
+        lit = lit[~self._caster.test_occlusions(towards_key, nthreads=self._threads).numpy()]
         direct = np.zeros(len(points), np.float32)
         direct[lit] = facing_key[lit]
         ambient = openness * (0.75 + 0.25 * normals[:, 2])
@@ -287,8 +294,8 @@ def _patch(origin, along_u, along_v, rows: np.ndarray, columns: np.ndarray):
 
 def _table(bin: Bin):
     """The table, fine near the bin, where its ambient occlusion changes."""
-    near = 0.5 + 0.5 * np.linspace(-1, 1, 64) * min(1.5 * max(bin.inner_width, bin.inner_depth) / _TABLE_HALF_WIDTH, 0.9)
-    lines = np.concatenate([[0.0], near, [1.0]])
+    reach = min(1.5 * max(bin.inner_width, bin.inner_depth) / _TABLE_HALF_WIDTH, 0.9)
+    lines = np.concatenate([[0.0], 0.5 + 0.5 * reach * np.linspace(-1, 1, 64), [1.0]])
     width = 2 * _TABLE_HALF_WIDTH
     return _patch((-width / 2, -width / 2, -bin.wall_thickness), (width, 0, 0), (0, width, 0), lines, lines)
 

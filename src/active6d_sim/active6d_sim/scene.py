@@ -72,9 +72,8 @@ class Scene:
             if poses.ndim != 3 or not is_rigid(poses):
                 raise ValueError(f"scene {self.name}: poses must be rigid (n, 4, 4) transforms")
         if self.visible_fraction.ndim != 2 or self.visible_fraction.shape[1] != len(self):
-            raise ValueError(
-                f"scene {self.name}: visible_fraction has shape {self.visible_fraction.shape}, expected (M, {len(self)})"
-            )
+            shape = self.visible_fraction.shape
+            raise ValueError(f"scene {self.name}: visible_fraction has shape {shape}, expected (M, {len(self)})")
 
     def __len__(self) -> int:
         return len(self.T_world_object)
