@@ -7,7 +7,7 @@ from scipy.special import expit, log_softmax, softmax
 
 from active6d_core.camera import PinholeCamera, pixel_rays
 from active6d_core.se3 import make_transform
-from active6d_perception.dense.gauge import Gauge, Turn, turn_about_z
+from active6d_perception.dense.gauge import Gauge, Turn, facing_camera, turn_about_z
 from active6d_perception.dense.network import split
 from active6d_perception.dense.network_input import ray_frames, ray_rotation
 from active6d_perception.dense.rigid_fit import robust_fit
@@ -96,8 +96,9 @@ def decode(
     T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
     agreement = np.ones(count)
     if gauge.turn is Turn.VISIBLE:
-        # The best turn of the axis votes' pose makes it a candidate for the fit.
         T = T @ turn_about_z(TURNS[_turn_probability(T, R_camera_ray, directions).argmax(axis=1)])
+    else:
+        T = facing_camera(T)
     if count and parameters.coordinates:
         trust = used * np.exp(-np.clip(parts["coordinates_scale"][:, 0], -4.0, 0.0))[table]
         T, agreement = robust_fit(
@@ -106,7 +107,7 @@ def decode(
             trust.astype(float),
             parameters.tolerance * diameter,
             np.random.default_rng(0),
-            T[:, None] if gauge.turn is Turn.VISIBLE else T[:, None, :, :][:, :0],
+            T[:, None],
         )
     turn = np.zeros((count, len(TURNS)))
     turn[:, 0] = 1.0

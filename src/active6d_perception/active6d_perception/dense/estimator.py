@@ -14,7 +14,7 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.dense.decoding import TURNS, DecodingParameters, Instances, decode
 from active6d_perception.dense.gauge import Turn, turn_about_z
-from active6d_perception.dense.network import fused
+from active6d_perception.dense.network import fused, has_fast_bfloat16
 from active6d_perception.dense.network_input import (
     OUTPUT_STRIDE,
     ReducedView,
@@ -28,7 +28,6 @@ from active6d_perception.dense.network_input import (
 from active6d_perception.dense.turns import feature_samples, turn_evidence
 from active6d_perception.dense.weights_file import TrainedNetwork, load_network, weights_path
 from active6d_perception.estimator import register_estimator
-from active6d_perception.geometric.foreground import smooth_within_surfaces
 from active6d_perception.model_views import model_views
 from active6d_perception.refinement import claim_pixels, refine, suppress, weigh_evidence
 from active6d_perception.symmetric_distance import SymmetricDistance
@@ -98,7 +97,8 @@ class DenseEstimator:
         self.parameters = parameters or DenseParameters()
         self.stage_ms: dict[str, float] = {}
         self._trained = trained
-        self._network = fused(trained.network).to(memory_format=torch.channels_last)
+        self._precision = torch.bfloat16 if has_fast_bfloat16() else torch.float32
+        self._network = fused(trained.network).to(dtype=self._precision, memory_format=torch.channels_last)
         self._views = model_views(model)
         self._distance = SymmetricDistance(model)
         samples = model.surface[0]
@@ -152,7 +152,8 @@ class DenseEstimator:
         """(channels, h, w) answer of the network."""
         tensor = torch.from_numpy(pad(network_input(view, self.model.diameter)))[None]
         with torch.inference_mode():
-            answer = self._network(tensor.contiguous(memory_format=torch.channels_last))[0]
+            inputs = tensor.to(dtype=self._precision, memory_format=torch.channels_last)
+            answer = self._network(inputs)[0].float()
         height, width = (size // OUTPUT_STRIDE for size in view.depth.shape)
         return answer[:, :height, :width].contiguous().numpy()
 
@@ -181,9 +182,10 @@ class DenseEstimator:
         return poses.take(np.flatnonzero((np.arange(len(certainty)) < count) | (certainty > 0.2)))
 
     def _refine_and_judge(self, poses: Poses, instances: Instances, view: ReducedView) -> tuple[Poses, np.ndarray]:
-        depth = smooth_within_surfaces(smooth_within_surfaces(view.depth, axis=0), axis=1)
+        # The reduced depth is a mean of pixels already; smoothing it more rounds edges off and lets poses slide.
+        depth = view.depth
         points = backproject(depth, view.camera)
-        normals = normals_from_points(points)
+        normals = normals_from_points(points, reach=1)
         T = poses.T_camera_object
         candidates = self._object_pixels(instances, view) & np.isfinite(depth)
         usable = candidates & np.isfinite(normals).all(axis=-1)

@@ -62,10 +62,7 @@ class Gauge:
     def canonical_pose(self, T_camera_object: np.ndarray) -> np.ndarray:
         """(n, 4, 4) ``T_camera_canonical`` of (n, 4, 4) poses."""
         T_camera_axis = self.axis_pose(T_camera_object)
-        if self.turn is Turn.VISIBLE:
-            return T_camera_axis
-        eye = invert(T_camera_axis)[:, :3, 3]
-        return T_camera_axis @ turn_about_z(np.arctan2(eye[:, 1], eye[:, 0]))
+        return T_camera_axis if self.turn is Turn.VISIBLE else facing_camera(T_camera_axis)
 
     def object_pose(self, T_camera_axis: np.ndarray) -> np.ndarray:
         """(n, 4, 4) ``T_camera_object`` from poses of the axis frame."""
@@ -78,6 +75,12 @@ def turn_about_z(angle: np.ndarray) -> np.ndarray:
     c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
     rows = [[c, -s, zero], [s, c, zero], [zero, zero, one]]
     return make_transform(np.stack([np.stack(row, axis=-1) for row in rows], axis=-2), np.zeros(3))
+
+
+def facing_camera(T_camera_axis: np.ndarray) -> np.ndarray:
+    """(n, 4, 4) poses, each turned about its z axis until the camera lies in its xz half plane with x > 0."""
+    eye = invert(T_camera_axis)[:, :3, 3]
+    return T_camera_axis @ turn_about_z(np.arctan2(eye[:, 1], eye[:, 0]))
 
 
 @lru_cache(maxsize=16)

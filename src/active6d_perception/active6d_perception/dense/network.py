@@ -98,6 +98,14 @@ def fused(network: DenseNetwork) -> DenseNetwork:
     return network
 
 
+def has_fast_bfloat16(device: str = "cpu") -> bool:
+    """Whether bfloat16 is faster than float32: on GPUs, and on processors that have instructions for it."""
+    if device == "cuda":
+        return True
+    capabilities = torch.cpu.get_capabilities()
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+
+
 def split(answer, axis: int = 1) -> dict:
     """The parts of an answer by the names of :data:`HEADS`; views of a torch tensor or NumPy array along ``axis``."""
     parts, start = {}, 0

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from active6d_core.object_model import ObjectModel
 from active6d_perception.dense.gauge import gauge_of
-from active6d_perception.dense.network import DenseNetwork, NetworkSize
+from active6d_perception.dense.network import DenseNetwork, NetworkSize, has_fast_bfloat16
 from active6d_perception.dense.weights_file import TrainedNetwork, save_network
 from active6d_perception.training.batches import TrainingViews, batches
 from active6d_perception.training.curves import draw_curves
@@ -164,7 +164,7 @@ class _Run:
         for group in self._optimizer.param_groups:
             group["lr"] = self._options.learning_rate * _schedule(self.step, self._options)
         inputs = inputs.to(self._device, memory_format=torch.channels_last)
-        with torch.autocast(self._device.type, torch.bfloat16, enabled=_has_fast_bfloat16(self._device)):
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=has_fast_bfloat16(self._device.type)):
             answer = self._network(inputs)
         terms = loss_terms(answer, targets)
         loss = total(terms, self._options.loss)
@@ -235,8 +235,3 @@ def _schedule(step: int, options: TrainingOptions) -> float:
     """Share of the highest learning rate: a linear warm-up, then half a cosine to zero."""
     warm = min(1.0, (step + 1) / options.warmup)
     return warm * 0.5 * (1 + math.cos(math.pi * step / options.steps))
-
-
-def _has_fast_bfloat16(device: torch.device) -> bool:
-    """Whether bfloat16 is faster than float32 there: on GPUs, and on CPUs with instructions for it."""
-    return device.type == "cuda" or torch.cpu.get_capabilities().get("avx512_bf16", False)
