@@ -14,7 +14,7 @@ from active6d_core.se3 import invert, look_at, make_transform, transform_points
 from active6d_perception.dense.decoding import DecodingParameters
 from active6d_perception.dense.estimator import DenseEstimator, DenseParameters
 from active6d_perception.dense.gauge import Turn, gauge_of
-from active6d_perception.dense.network import DenseNetwork, NetworkSize, split
+from active6d_perception.dense.network import HEADS, DenseNetwork, NetworkSize, split
 from active6d_perception.dense.network_input import output_camera, ray_frames, ray_rotation, reduction
 from active6d_perception.dense.sphere_bins import CENTRES
 from active6d_perception.dense.weights_file import TrainedNetwork, load_network, save_network
@@ -57,11 +57,13 @@ def mug_view():
 def right_answer(sample, targets):
     """What a perfect network would say."""
     h, w = sample.surface_depth.shape
-    answer = np.zeros((sum(value.shape[0] for value in split(np.zeros((200, 1)), axis=0).values()), h, w), np.float32)
+    answer = np.zeros((sum(HEADS.values()), h, w), np.float32)
     parts = split(answer, axis=0)
     parts["mask"][0] = np.where(targets.mask > 0, 6, -6)
     for name in ("centre", "coordinates", "axis"):
         parts[name].reshape(3, -1)[:, targets.pixel] = getattr(targets, name).T
+    axis = targets.axis.T
+    parts["axis_line"].reshape(6, -1)[:, targets.pixel] = [*axis**2, axis[0] * axis[1], axis[1] * axis[2], axis[2] * axis[0]]
     parts["direction"].reshape(len(CENTRES), -1)[:, targets.pixel] = np.log(targets.direction.T + 1e-6)
     return answer
 

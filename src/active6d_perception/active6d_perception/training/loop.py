@@ -75,11 +75,13 @@ class Report:
     Attributes:
         step: steps done.
         loss: of this step's batch.
+        terms: that it is the weighted sum of.
         validation: the latest rates, empty before the first validation.
     """
 
     step: int
     loss: float
+    terms: dict[str, float]
     validation: dict[str, float]
 
 
@@ -119,7 +121,8 @@ def train(
     running: list[dict[str, float]] = []
     while run.step < options.steps:
         inputs, targets = next(feed)
-        running.append(run.advance(inputs, targets))
+        terms = run.advance(inputs, targets)
+        running.append(terms)
         if run.step % options.validate_every == 0 or run.step == options.steps:
             mean = {f"training_{name}": sum(item[name] for item in running) / len(running) for name in running[0]}
             running.clear()
@@ -134,7 +137,7 @@ def train(
             draw_curves(run.history, folder / "curves.png", title=f"{model.name}: training of the dense estimator")
         if run.step % options.checkpoint_every == 0 or run.step == options.steps:
             run.save()
-        on_step(Report(run.step, run.loss, run.history[-1] if run.history else {}))
+        on_step(Report(run.step, run.loss, terms, run.history[-1] if run.history else {}))
     return best
 
 

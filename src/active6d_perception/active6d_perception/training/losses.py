@@ -22,6 +22,7 @@ class LossWeights:
     centre: float = 0.5
     coordinates: float = 0.5
     axis: float = 1.0
+    axis_line: float = 1.0
     direction: float = 0.3
 
 
@@ -48,6 +49,7 @@ def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
         error = (parts[name] - wanted[name]).norm(dim=1)
         terms[name] = (weight * (error * torch.exp(-log_scale) + 3 * log_scale)).sum()
     terms["axis"] = (weight * (parts["axis"] - wanted["axis"]).norm(dim=1)).sum()
+    terms["axis_line"] = (weight * (parts["axis_line"] - _line(wanted["axis"])).norm(dim=1)).sum()
     cross_entropy = -(wanted["direction"] * F.log_softmax(parts["direction"], dim=1)).sum(dim=1)
     terms["direction"] = (weight * cross_entropy).sum()
     return terms
@@ -56,6 +58,11 @@ def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
 def total(terms: dict[str, Tensor], weights: LossWeights) -> Tensor:
     """The weighted sum of the terms."""
     return sum(getattr(weights, name) * value for name, value in terms.items())
+
+
+def _line(axis: Tensor) -> Tensor:
+    """(p, 6) products xx, yy, zz, xy, yz, zx of (p, 3) vectors: the same for an axis and its opposite."""
+    return torch.cat([axis * axis, axis * axis.roll(-1, dims=1)], dim=1)
 
 
 def _gather(targets: Sequence[Targets], name: str, like: Tensor) -> Tensor:
