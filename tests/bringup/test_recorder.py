@@ -15,11 +15,11 @@ from rclpy.serialization import serialize_message
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
+from stub_episode import StubEpisode, is_latched
 
 from active6d_bringup.nodes.episode_recorder import EpisodeRecorderNode
 from active6d_bringup.recording import CONTRACT, TYPESTORE, RecordingError, stamp_of
 from active6d_core.node import GraphNode
-from stub_episode import StubEpisode, is_latched
 
 TYPES = {topic.name: topic.type for topic in CONTRACT}
 
@@ -27,8 +27,8 @@ TYPES = {topic.name: topic.type for topic in CONTRACT}
 def record(graph, folder, episode, late=False):
     """Send the stub episode past a recorder, which starts after the first latched messages if ``late``."""
     sent = episode.messages()
-    early = [item for item in sent if late and is_latched(item[0]) and item[1].header.stamp.sec == 1][:6]
-    early = [item for item in early if item[1].header.stamp.nanosec == 0]
+    first = {topic: message for topic, message in reversed(sent) if is_latched(topic) and topic != "episode/end"}
+    early = list(first.items()) if late else []
     for topic, message in early:
         graph.publish(topic, message, latched=True, subscribers=0)
     recorder = graph.add(EpisodeRecorderNode(context=graph.context, overrides={"bag": str(folder)}))
@@ -117,7 +117,7 @@ def test_completeness_names_the_topics_awaited(graph, tmp_path):
     assert not answer.success
     assert "attention_policy, hypothesis_fusion" in answer.message
     for topic, message in late:
-        graph.publish(topic, message)
+        graph.publish(topic, message, latched=is_latched(topic))
     graph.spin_until(lambda: not recorder.missing(last))
     assert graph.call(Trigger, "episode_recorder/complete").success
 

@@ -257,6 +257,10 @@ def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> N
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except RuntimeError:
+        # An interrupt between the executor's look at the context and its wait ends in rcl's own error.
+        if rclpy.ok():
+            raise
     finally:
         # A terminal and `ros2 launch` both interrupt their children: the second must not tear the clean-up.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
