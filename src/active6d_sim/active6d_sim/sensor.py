@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+from scipy.special import expit
 
 from active6d_core.camera import PinholeCamera, pixel_rays
 from active6d_sim.renderer import RenderedView
@@ -104,7 +105,7 @@ def _loss(rendered: RenderedView, camera: PinholeCamera, noise: SensorNoise) -> 
     rays = pixel_rays(camera)
     cosine = -np.einsum("...i,...i", rendered.normals, rays) / np.sqrt(np.einsum("...i,...i", rays, rays))
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    kept = 1 - 1 / (1 + np.exp(-(angle - noise.grazing_degrees) / noise.grazing_width_degrees))
+    kept = expit((noise.grazing_degrees - angle) / noise.grazing_width_degrees)
     if noise.edge_loss > 0:
         filled = np.nan_to_num(rendered.depth, nan=100.0)
         edge = maximum_filter(filled, 3) - minimum_filter(filled, 3) > noise.edge_step
