@@ -5,10 +5,10 @@ import shutil
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
+from stub_episode import StubEpisode
 
 from active6d_bringup.bag import BagError, read_episode, read_episodes
 from active6d_bringup.recording import CONTRACT, EpisodeWriter
-from stub_episode import StubEpisode
 
 NAMES = {topic.name: topic.name if topic.name.startswith("/") else f"/{topic.name}" for topic in CONTRACT}
 

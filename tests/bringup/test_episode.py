@@ -6,13 +6,13 @@ import signal
 import numpy as np
 import pytest
 import yaml
+from ros_harness import fresh_domain
 
 from active6d_bringup.bag import read_episode
 from active6d_bringup.composition import NODES, GraphDescription
 from active6d_bringup.episode import EpisodeError, EpisodeInterrupted, EpisodeSettings, describe, run_episode
 from active6d_bringup.recording import CONTRACT, RecordingError
 from active6d_bringup.replay import ReplaySettings, replay
-from ros_harness import fresh_domain
 
 
 @pytest.fixture(autouse=True)

@@ -9,13 +9,13 @@ import time
 import numpy as np
 import psutil
 import pytest
+from ros_harness import fresh_domain
 
 from active6d_bringup import processes as processes_module
 from active6d_bringup.bag import read_episode
 from active6d_bringup.composition import NODES, GraphDescription, running
 from active6d_bringup.episode import EpisodeInterrupted, EpisodeSettings, run_episode
 from active6d_bringup.processes import ProcessError, ProcessGraph
-from ros_harness import fresh_domain
 
 
 @pytest.fixture
