@@ -52,7 +52,7 @@ def test_objects_lie_in_the_bin(scene):
 
 
 def test_objects_rest(scene):
-    """Half a second later, in a fresh physics server with other damping, nothing has moved by more than a millimetre."""
+    """Half a second later, in a fresh physics server with little damping, nothing has moved by a millimetre."""
     model = load_object(scene.object_name)
     client = connect()
     client.setGravity(0, 0, -9.81)
