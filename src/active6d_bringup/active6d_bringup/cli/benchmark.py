@@ -60,7 +60,7 @@ def graph(
 def estimator(
     object_name: ObjectName = "mug",
     names: Annotated[
-        list[str] | None, typer.Option("--estimator", help="Estimator; repeatable. All by default.")
+        list[str] | None, typer.Option("--estimator", help="Estimator; repeatable. All that know the object by default.")
     ] = None,
     split: Annotated[str, typer.Option(help="Which stored scenes.")] = "test",
     sample: Annotated[int | None, typer.Option(min=1, help="That many views, drawn by --seed; all by default.")] = None,
@@ -76,14 +76,17 @@ def estimator(
     from rich.table import Table
 
     from active6d_bringup.benchmark.estimator import VISIBLE, measure_estimators
+    from active6d_perception.dense.weights_file import weights_path
     from active6d_perception.estimator import list_estimators
 
+    # The learned one takes part for objects that it has learned.
+    able = [name for name in list_estimators() if name != "dense" or weights_path(object_name).is_file()]
     with progress_bar() as progress:
         task = progress.add_task("loading", total=None)
         result = measure_estimators(
             object_name,
             split,
-            names or list_estimators(),
+            names or able,
             sample=sample,
             moves=moves,
             seed=seed,
