@@ -223,7 +223,7 @@ def test_scale_is_learned_from_the_error(mug_view):
     losses = []
     for scale in (0.05, 0.1, 0.2):
         parts["centre_scale"][:] = np.log(scale)
-        losses.append(float(loss_terms(answer, [targets])["centre"]))
+        losses.append(float(loss_terms(answer, [targets])["scale"]))
     assert losses[1] < min(losses[0], losses[2])
 
 
@@ -246,7 +246,7 @@ def test_a_small_network_learns_a_view_by_heart(mug_view):
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    assert losses[-1] < losses[0] - 4
+    assert losses[-1] < 0.3 * losses[0]
     estimator = DenseEstimator(model, TrainedNetwork(network, gauge, model.name, model.diameter, size))
     hypotheses = estimator.estimate(view)
     errors = e_add(model, hypotheses.T_camera_object[:, None], sample.T_camera_object[None])

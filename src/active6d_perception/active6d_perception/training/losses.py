@@ -18,9 +18,10 @@ SCALE_RANGE = (-5.8, 0.4)
 class LossWeights:
     """Weight of each term; 0 switches a head's training off."""
 
-    mask: float = 3.0
-    centre: float = 0.5
-    coordinates: float = 0.5
+    mask: float = 1.0
+    centre: float = 2.0
+    coordinates: float = 2.0
+    scale: float = 0.1
     axis: float = 1.0
     axis_line: float = 1.0
     direction: float = 0.3
@@ -29,8 +30,10 @@ class LossWeights:
 def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
     """The terms of the loss, by the names of :class:`LossWeights`.
 
-    Points have the error ``e = ||x - x*||`` and the negative log-likelihood ``e / b + 3 log b`` of an isotropic
-    Laplace distribution in space whose scale b the network tells, so it learns to say where it is unsure.
+    ``centre``, ``coordinates`` and ``axis`` are mean distances ``e``, the first two in diameters. ``scale`` is the negative
+    log-likelihood ``e / b + 3 log b`` of an isotropic Laplace distribution in space whose scale b the network tells, so
+    it learns to say where it is unsure. The errors in it are held fixed: a likelihood that trained the points as well
+    would weigh each head by 1 / b, and what is learned first (the centre) would drown what is hard (the axis).
 
     Args:
         answer: (n, channels, h, w), at least as large as the targets.
@@ -44,10 +47,12 @@ def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
     parts = split(answer.movedim(1, -1).reshape(-1, answer.shape[1])[pixel.to(answer.device)], axis=1)
     wanted = {name: _gather(targets, name, answer) for name in ("weight", "centre", "coordinates", "axis", "direction")}
     weight = wanted["weight"] / wanted["weight"].sum().clamp(min=1.0)
+    terms["scale"] = answer.new_zeros(())
     for name in ("centre", "coordinates"):
         log_scale = parts[f"{name}_scale"][:, 0].clamp(*SCALE_RANGE)
         error = (parts[name] - wanted[name]).norm(dim=1)
-        terms[name] = (weight * (error * torch.exp(-log_scale) + 3 * log_scale)).sum()
+        terms[name] = (weight * error).sum()
+        terms["scale"] = terms["scale"] + (weight * (error.detach() * torch.exp(-log_scale) + 3 * log_scale)).sum()
     terms["axis"] = (weight * (parts["axis"] - wanted["axis"]).norm(dim=1)).sum()
     terms["axis_line"] = (weight * (parts["axis_line"] - _line(wanted["axis"])).norm(dim=1)).sum()
     cross_entropy = -(wanted["direction"] * F.log_softmax(parts["direction"], dim=1)).sum(dim=1)
