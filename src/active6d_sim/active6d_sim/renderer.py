@@ -187,18 +187,18 @@ class SceneRenderer:
         offset = points[lit] + 5e-4 * normals[lit]
         towards_key = _rays(offset, np.broadcast_to(key, offset.shape))
         lit = lit[~self._caster.test_occlusions(towards_key, nthreads=self._threads).numpy()]
-        direct = np.zeros(len(points), np.float32)
-        direct[lit] = facing_key[lit]
-        ambient = openness * (0.75 + 0.25 * normals[:, 2])
-        filled = openness * np.maximum(normals @ fill, 0)
-        strengths = np.stack([direct, ambient, filled], axis=1)
+        texture = self._texture(points, material)
+        strengths = np.zeros((len(points), 3), np.float32)
+        strengths[lit, 0] = facing_key[lit] * texture[lit]
+        texture *= openness
+        strengths[:, 1] = texture * (0.75 + 0.25 * normals[:, 2])
+        strengths[:, 2] = texture * np.maximum(normals @ fill, 0)
         light = strengths @ np.array([look.key_color, look.ambient_color, look.fill_color], np.float32)
-        albedo = self._palette[material]
-        albedo *= self._texture(points, material)[:, None]
-        light *= albedo
+        light *= self._palette[material]
         self._add_highlights(light, lit, normals, material, directions, key)
         self._paint_backdrop(light, points, material, directions)
-        return _TO_SRGB[np.minimum(light * 4095, 4095).astype(np.int16)]
+        light *= len(_TO_SRGB) - 1
+        return _TO_SRGB[np.minimum(light, len(_TO_SRGB) - 1, out=light).astype(np.int16)]
 
     def _texture(self, points: np.ndarray, material: np.ndarray) -> np.ndarray:
         """(p,) brightness factor; walls are textured along x + z and y + z, which needs no parametrisation."""
