@@ -1,5 +1,7 @@
 """A made-up bank: an estimator that errs the more, the more other objects stand in its line of sight."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -47,4 +49,4 @@ def observe_synthetic(name: str, log: str) -> BankScene:
     """Picklable stand-in for simulator and estimator; notes down what it was asked for."""
     with open(log, "a") as file:
         file.write(name + "\n")
-    return synthetic_scene("mug", int(name.split("/")[-1]), 3, ViewSphere())
+    return replace(synthetic_scene("mug", int(name.split("/")[-1]), 3, ViewSphere()), name=name)

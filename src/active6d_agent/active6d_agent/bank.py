@@ -26,6 +26,7 @@ from active6d_perception.estimator import Estimator
 from active6d_perception.verification import Verifier
 
 FORMAT = 1
+SHIPPED_BANKS = Path(__file__).parent / "banks"
 _HYPOTHESIS_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw", "verification", "score", "x0", "y0", "x1", "y1", "depth")
 
 
@@ -135,7 +136,7 @@ def build_bank(
     """Observe all scenes and write the bank; yields each scene's name as it is done.
 
     Finished scenes are kept beside ``path`` until the bank is complete, so a run that was interrupted goes on where it
-    stopped; scenes that were made with another ``provenance`` are made again.
+    stopped, and a bank that is there is only extended; what was made with another ``provenance`` is made again.
 
     Args:
         path: of the ``.npz`` to write.
@@ -147,13 +148,14 @@ def build_bank(
         sphere: grid of the views, the default one when None.
     """
     sphere, provenance = sphere or ViewSphere(), provenance or {}
+    known = _scenes_of(path, provenance)
     parts = path.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
-    files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes}
-    missing = [name for name in scenes if not _is_finished(files[name], provenance)]
+    files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes if name not in known}
+    missing = [name for name, file in files.items() if not _scenes_of(file, provenance)]
     yield from (name for name in scenes if name not in missing)
     # Spawned, because a forked child inherits locks of threads that do not live on in it (Embree, BLAS).
-    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    pool = ProcessPoolExecutor(max(1, min(workers, len(missing))), mp_context=multiprocessing.get_context("spawn"))
     try:
         running = {
             pool.submit(
@@ -166,18 +168,22 @@ def build_bank(
             yield running[done]
     finally:
         pool.shutdown(cancel_futures=True)
-    SceneBank(object_name, sphere, [load_bank(files[name]).scenes[0] for name in scenes], provenance).save(path)
+    made = known | {name: load_bank(file).scenes[0] for name, file in files.items()}
+    SceneBank(object_name, sphere, [made[name] for name in scenes], provenance).save(path)
     for file in files.values():
         file.unlink()
-    parts.rmdir()
+    if not any(parts.iterdir()):
+        parts.rmdir()
 
 
-def _is_finished(path: Path, provenance: dict) -> bool:
-    """Whether a scene's file is whole and was made the same way."""
+def _scenes_of(path: Path, provenance: dict) -> dict[str, BankScene]:
+    """The scenes of a bank that is whole and was made the same way, by name; none otherwise."""
     try:
-        return load_bank(path).provenance == json.loads(json.dumps(provenance))
+        bank = load_bank(path)
     except ValueError:
-        return False
+        return {}
+    same = bank.provenance == json.loads(json.dumps(provenance))
+    return {scene.name: scene for scene in bank.scenes} if same else {}
 
 
 def _observe_to_file(observe: Callable[[str], BankScene], name: str, path: Path, bank: "SceneBank") -> None:
@@ -233,6 +239,33 @@ class SceneBank:
                 entropy=[scene.entropy for scene in self.scenes],
             )
         unfinished.replace(path)
+
+
+def cached_banks() -> Path:
+    """Folder that banks are made in unless another is asked for."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "active6d" / "banks"
+
+
+def bank_path(folder: Path, object_name: str, split: str) -> Path:
+    """Where the bank of an object and split lies in a folder of banks."""
+    return folder / f"{object_name}_{split}.npz"
+
+
+def find_bank(object_name: str, split: str, folder: Path | None = None) -> Path:
+    """The bank of an object and split in ``folder``; without one, in the cache or else among the shipped ones.
+
+    Raises:
+        ValueError: there is none; the message says what makes it.
+    """
+    folders = (cached_banks(), SHIPPED_BANKS) if folder is None else (folder,)
+    for path in (bank_path(each, object_name, split) for each in folders):
+        if path.is_file():
+            return path
+    into = "" if folder is None else f" --banks {folder}"
+    raise ValueError(
+        f"there is no {split} bank of '{object_name}' in {folders[0]}; "
+        f"make it with: active6d bank --object {object_name} --split {split}{into}"
+    )
 
 
 def load_bank(path: Path) -> SceneBank:

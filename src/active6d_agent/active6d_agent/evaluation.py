@@ -11,6 +11,8 @@ from active6d_agent.policy import Observation, Policy, create_policy
 
 BOUNDS = ("oracle", "all-views")
 _RESAMPLES = 2000
+# Episodes between two reports of progress.
+_TOGETHER = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +121,24 @@ def run_named(
         found = [search_views(lookup, int(index), int(view), steps) for index, view in starts]
         return measure(lookup, scene, np.stack(found))
     if name == "all-views":
-        everything = np.tile(np.arange(len(lookup.sphere)), (len(starts), 1))
-        return measure(lookup, scene, (everything + starts[:, 1:]) % len(lookup.sphere))
+        return _all_views(lookup, starts)
 
     def make(index: int) -> Policy:
         own = {"entropy": lookup.bank.scenes[index].entropy} if name == "entropy" else {}
         return create_policy(name, lookup.model, **{**own, **(parameters or {})})
 
     return run_policy(lookup, make, starts, steps, seed=seed)
+
+
+def _all_views(lookup: BankLookup, starts: np.ndarray) -> EpisodeResults:
+    """Every view of the grid in its order from the first on; each scene is fused once, since order changes nothing."""
+    grid = np.arange(len(lookup.sphere))
+    scenes, inverse = np.unique(starts[:, 0], return_inverse=True)
+    once = measure(lookup, scenes, np.tile(grid, (len(scenes), 1)))
+    views = (grid + starts[:, 1:]) % len(grid)
+    steps = lookup.sphere.positions[views]
+    metres = lookup.sphere.arc(steps[:, :-1], steps[:, 1:]).sum(axis=1)
+    return EpisodeResults(once.detection_rate[inverse], once.e_add_mm[inverse], metres, views)
 
 
 def bootstrap_interval(values: np.ndarray, rng: np.random.Generator, resamples: int = _RESAMPLES) -> list[float]:
@@ -146,10 +158,26 @@ def evaluate(
     *,
     seed: int = 0,
     parameters: dict[str, dict] | None = None,
+    on_progress: Callable[[str, int], None] = lambda name, episodes: None,
 ) -> Iterator[tuple[str, EpisodeResults]]:
-    """Run every policy from the same starts; yields each as it is done."""
+    """Run every policy from the same starts; yields each as it is done.
+
+    Args:
+        lookup: of the bank.
+        names: of policies and bounds.
+        steps: moves T.
+        starts: (E, 2) scenes and first views.
+        seed: of the policies' randomness.
+        parameters: name to parameters.
+        on_progress: called with the name and how many more of its episodes are done.
+    """
     for name in names:
-        yield name, run_named(lookup, name, starts, steps, seed=seed, parameters=(parameters or {}).get(name))
+        parts = []
+        for some in np.array_split(starts, -(-len(starts) // _TOGETHER)):
+            parts.append(run_named(lookup, name, some, steps, seed=seed, parameters=(parameters or {}).get(name)))
+            on_progress(name, len(some))
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        yield name, EpisodeResults(*map(np.concatenate, columns))
 
 
 def summarise(results: dict[str, EpisodeResults], object_name: str, steps: int, seed: int = 0) -> dict:

@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from active6d_bringup.cli import benchmark, doctor, episode, objects, replay, report, scenes, train
+from active6d_bringup.cli import bank, benchmark, doctor, episode, evaluate, objects, replay, report, scenes, train
 
 
 class CommandGroup(TyperGroup):
@@ -62,6 +62,8 @@ app.command()(doctor.doctor)
 app.command()(episode.episode)
 app.command()(replay.replay)
 app.command()(report.report)
+app.command()(bank.bank)
+app.command()(evaluate.evaluate)
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
 app.add_typer(benchmark.app, name="benchmark")

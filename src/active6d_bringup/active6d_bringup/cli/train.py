@@ -84,7 +84,7 @@ def _render_missing(object_name: str, folder: Path, heaps: int, views: int, core
         # Threads do not survive a fork, and the ray caster and the network library have some.
         with (
             progress_bar() as bar,
-            _single_threaded(),
+            single_threaded(),
             ProcessPoolExecutor(min(cores, len(missing)), mp_context=get_context("spawn")) as pool,
         ):
             task = bar.add_task(f"{object_name}: rendering heaps", total=len(missing))
@@ -96,7 +96,7 @@ def _render_missing(object_name: str, folder: Path, heaps: int, views: int, core
 
 
 @contextmanager
-def _single_threaded() -> Iterator[None]:
+def single_threaded() -> Iterator[None]:
     """Processes started inside use one thread each: there is one for every core."""
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"

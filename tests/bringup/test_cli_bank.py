@@ -1,0 +1,114 @@
+"""``active6d bank`` and ``active6d evaluate``: a bank of two views, and Table 1 on a made-up bank."""
+
+import json
+
+import numpy as np
+import pytest
+from synthetic_bank import synthetic_bank
+from typer.testing import CliRunner
+
+from active6d_agent.bank import bank_path, find_bank, load_bank
+from active6d_agent.evaluation import all_starts, run_named
+from active6d_agent.lookup import BankLookup
+from active6d_bringup.cli import app
+from active6d_bringup.cli import bank as bank_command
+
+
+def run(*arguments: str):
+    return CliRunner().invoke(app, list(arguments), env={"COLUMNS": "200", "TERM": "dumb"})
+
+
+@pytest.fixture(scope="module")
+def banks(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("banks")
+    made = synthetic_bank("mug", scenes=2, objects=6)
+    for split in ("train", "val", "test"):
+        made.save(bank_path(folder, "mug", split))
+    return folder
+
+
+def test_table_1_is_the_policies_episodes(banks, tmp_path):
+    file = tmp_path / "mug.json"
+    names = "single-view,random,oracle,all-views"
+    result = run("evaluate", "--object", "mug", "--policies", names, "--steps", "2", "--sample", "9",
+                 "--banks", str(banks), "--json", str(file), "--seed", "3")  # fmt: skip
+    assert result.exit_code == 0, result.stderr
+    measured = json.loads(file.read_text())
+    assert (measured["object"], measured["steps"], measured["episodes"]) == ("mug", 2, 9)
+    lookup = BankLookup(load_bank(bank_path(banks, "mug", "test")))
+    starts = all_starts(lookup, 9, 3)
+    for name in names.split(","):
+        row, expected = measured["policies"][name], run_named(lookup, name, starts, 2, seed=3)
+        assert row["detection_rate"] == pytest.approx(expected.detection_rate.mean())
+        assert row["e_add_mm"] == pytest.approx(expected.e_add_mm.mean())
+        assert row["distance_m"] == pytest.approx(expected.distance_m.mean())
+        low, high = row["detection_rate_ci95"]
+        assert low <= row["detection_rate"] <= high
+        assert f"{row['detection_rate']:.3f}" in result.stdout
+    assert measured["policies"]["random"]["gap_closed"] == 0.0
+    assert measured["policies"]["oracle"]["gap_closed"] == 1.0
+
+
+def test_a_policys_parameter_can_be_set(banks, tmp_path):
+    file = tmp_path / "mug.json"
+    common = ("evaluate", "--policies", "unidirectional", "--steps", "1", "--sample", "5", "--banks", str(banks))
+    assert run(*common, "--set", "unidirectional.elevation_degrees=75", "--json", str(file)).exit_code == 0
+    steep = json.loads(file.read_text())["policies"]["unidirectional"]["distance_m"]
+    assert run(*common, "--json", str(file)).exit_code == 0
+    assert json.loads(file.read_text())["policies"]["unidirectional"]["distance_m"] != steep
+
+
+def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp_path):
+    """Two scenes from synthetic eyes; the second run makes only the third scene."""
+    from functools import partial
+
+    from synthetic_bank import observe_synthetic
+
+    from active6d_agent import bank as bank_module
+
+    log = tmp_path / "log"
+    real = bank_module.build_bank
+
+    def build(path, object_name, names, observe, **keywords):
+        assert observe.keywords == {"estimator": "geometric", "noise": 1.0, "seed": 0}
+        return real(path, object_name, names, partial(observe_synthetic, log=str(log)), **keywords)
+
+    monkeypatch.setattr(bank_command, "observe_scene_by_name", len)
+    monkeypatch.setattr(bank_module, "build_bank", build)
+    arguments = ("bank", "--object", "mug", "--split", "val", "--workers", "1", "--banks", str(tmp_path))
+    result = run(*arguments, "--scenes", "2", "--json", str(tmp_path / "bank.json"))
+    assert result.exit_code == 0, result.stderr
+    assert sorted(log.read_text().split()) == ["mug/val/0", "mug/val/1"]
+    assert run(*arguments, "--scenes", "3").exit_code == 0
+    assert log.read_text().split()[2:] == ["mug/val/2"]
+    made = load_bank(find_bank("mug", "val", tmp_path))
+    assert len(made.scenes) == 3
+    measured = json.loads((tmp_path / "bank.json").read_text())
+    assert measured["scenes"] == 2
+    found = []
+    for scene in made.scenes[:2]:
+        right = scene.errors < 0.1 * made.model.diameter
+        found += [right[scene.view == view].any(axis=0).mean() for view in range(100)]
+    assert measured["found_in_one_view"] == pytest.approx(np.mean(found))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["evaluate", "--banks", "/nowhere"], "active6d bank --object mug --split test --banks /nowhere"),
+        (["evaluate", "--policies", "psychic"], "unknown policy 'psychic'"),
+        (["evaluate", "--steps", "100"], "--steps 100"),
+        (["evaluate", "--policies", "random", "--set", "random.gain=1"], "has no parameter 'gain'"),
+        (["evaluate", "--policies", "random", "--set", "entropy.gain=1"], "--set entropy"),
+        (["bank", "--split", "holdout"], "--split 'holdout'"),
+        (["bank", "--estimator", "psychic"], "unknown estimator 'psychic'"),
+        (["bank", "--object", "teapot"], "unknown object 'teapot'"),
+        (["bank", "--heaps", "3"], "--heaps adds to the training scenes"),
+    ],
+)
+def test_bad_input_is_one_clear_line(banks, arguments, words):
+    if arguments[0] == "evaluate" and "--banks" not in arguments:
+        arguments = [*arguments, "--banks", str(banks)]
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert words in result.stderr.strip().splitlines()[-1]
