@@ -1,50 +1,19 @@
-"""Hand-made scenes of few objects, so that no test here waits for physics."""
+"""Heaps that physics dropped once for all tests of them."""
 
-import numpy as np
 import pytest
-import trimesh
-from scipy.spatial.transform import Rotation
 
-from active6d_core.camera import PinholeCamera
-from active6d_core.object_model import ObjectModel, Symmetry
-from active6d_core.se3 import make_transform
-from active6d_core.view_sphere import ViewSphere
-from active6d_sim import scene_store
-from active6d_sim.scene import Bin, Scene
-
-SPHERE = ViewSphere()
-
-
-def make_model(mesh: trimesh.Trimesh) -> ObjectModel:
-    """A grey object without symmetry."""
-    diameter = float(np.linalg.norm(mesh.extents))
-    return ObjectModel("test", mesh, diameter, Symmetry(None, np.eye(3)[None]), (1, 3), np.full(3, 0.5), {})
-
-
-def make_scene(T_world_object, bin=Bin(0.36, 0.36, 0.06, 0.01), name="mug/test/0", seed=5) -> Scene:
-    """A scene in which every view is said to show everything."""
-    return Scene(name.split("/")[0], name, seed, T_world_object, bin, np.ones((len(SPHERE), len(T_world_object))))
+from active6d_core.object_model import load_object
+from active6d_sim.heap import drop_heap
+from active6d_sim.scene import Scene
 
 
 @pytest.fixture(scope="session")
-def camera() -> PinholeCamera:
-    """A small picture with a principal point off its centre."""
-    return PinholeCamera(64, 48, 55.0, 57.0, 30.7, 24.2)
+def bunny_heap() -> Scene:
+    """Seven bunnies."""
+    return drop_heap(load_object("bunny"), 5, count=7)
 
 
 @pytest.fixture(scope="session")
-def mugs() -> Scene:
-    """Three mugs side by side."""
-    R = Rotation.from_euler("xyz", [[0, 0, 0], [90, 0, 40], [0, 0, 200]], degrees=True).as_matrix()
-    return make_scene(make_transform(R, [[-0.11, 0.0, 0.05], [0.0, 0.1, 0.05], [0.12, -0.03, 0.05]]))
-
-
-@pytest.fixture
-def stored_mugs(mugs, tmp_path, monkeypatch) -> Scene:
-    """The only stored scenes: mug/test/0, and with one mug less, mug/test/1."""
-    monkeypatch.setattr(scene_store, "SHIPPED_SCENES", tmp_path / "none")
-    monkeypatch.setenv("ACTIVE6D_SCENE_PATH", str(tmp_path))
-    (tmp_path / "mug").mkdir()
-    mugs.save(tmp_path / "mug" / "test_00.npz")
-    make_scene(mugs.T_world_object[:2], mugs.bin, "mug/test/1", 6).save(tmp_path / "mug" / "test_01.npz")
-    return mugs
+def mug_heap() -> Scene:
+    """Eight mugs."""
+    return drop_heap(load_object("mug"), 5, count=8)
