@@ -61,7 +61,8 @@ class BagPlayerNode(GraphNode):
             self._timer = None
 
     def _on_objects(self, message: PointCloud2) -> None:
-        if self._rate == 0 and stamp_to_ns(message.header.stamp) == self._stamps[self._next - 1]:
+        # Objects of the last view may come again after the end: a fusion node that was restarted repeats them.
+        if self._rate == 0 and stamp_to_ns(message.header.stamp) == self._stamps[: self._next][-1]:
             self._publish_next()
 
     def _publish_next(self) -> None:
