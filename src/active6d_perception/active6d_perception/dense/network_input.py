@@ -16,12 +16,14 @@ from active6d_core.camera import PinholeCamera, View, backproject, normals_from_
 INPUT_WIDTH = 320
 #: Sides of the input are padded to multiples of this.
 MULTIPLE = 16
-#: Colour (3), normal (3), depth against its surroundings, near and far (2), validity, apparent size.
-CHANNELS = 10
+#: Colour (3), normal (3), depth against its surroundings, near and far (2), validity, apparent size, and the second
+#: moments of the normals around (6): how the surface curves, which is the axis of a cylinder but for its sign.
+CHANNELS = 16
 #: The network answers at the input's resolution divided by this.
 OUTPUT_STRIDE = 2
 
 _WINDOWS = (13, 61)  # pixels: a detail of an object, and more than an object
+_MOMENT_WINDOW = 17  # pixels: half of an object
 _SAME_SURFACE = 0.02  # relative difference of depth
 
 
@@ -107,7 +109,15 @@ def network_input(view: ReducedView, diameter: float) -> np.ndarray:
     channels[8] = valid
     # The last window's mean depth stands in where a pixel has none.
     channels[9] = view.camera.fx * diameter / np.maximum(np.where(valid, z, around), 0.1) / 64
+    channels[10:] = _normal_moments(channels[3:6])
     return channels
+
+
+def _normal_moments(normals: np.ndarray) -> np.ndarray:
+    """(6, h, w) means of nx nx, ny ny, nz nz, nx ny, ny nz, nz nx around each pixel, of (3, h, w) normals, 0 if invalid."""
+    products = np.concatenate([normals * normals, normals * np.roll(normals, -1, axis=0)])
+    moments = uniform_filter(products, (0, _MOMENT_WINDOW, _MOMENT_WINDOW), mode="nearest")
+    return moments / np.maximum(moments[:3].sum(axis=0), 1e-2)
 
 
 def pad(tensor: np.ndarray) -> np.ndarray:
