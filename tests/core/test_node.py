@@ -1,14 +1,21 @@
 """The base of every node: parameters, guarded inputs, diagnostics, lifecycle and the matching of stamps."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
-from active6d_core.conversions import MessageError, depth_to_image, image_to_depth, stamp_to_ns
-from active6d_core.node import GraphNode, StampSynchronizer
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from hypothesis import given
 from hypothesis import strategies as st
+from ros_harness import fresh_domain
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
+
+from active6d_core.conversions import MessageError, depth_to_image, image_to_depth, stamp_to_ns
+from active6d_core.node import GraphNode, StampSynchronizer
 
 
 class DepthNode(GraphNode):
@@ -35,7 +42,7 @@ class DepthNode(GraphNode):
 
 
 @pytest.mark.parametrize(
-    "overrides, text",
+    ("overrides", "text"),
     [
         ({"gain": -1.0}, "parameter 'gain' is -1.0, must be >= 0.0 and <= 10.0"),
         ({"gain": float("nan")}, "parameter 'gain' is nan"),
@@ -92,6 +99,52 @@ def test_a_failing_setup_is_reported_with_its_reason(graph):
     node.fail_at_setup = True
     with pytest.raises(ValueError, match="missing.ply"):
         node.start()
+
+
+def test_a_node_that_fails_to_begin_stays_inactive(graph):
+    class FailingNode(DepthNode):
+        def begin(self):
+            raise ValueError("no first view")
+
+    node, results = graph.add(FailingNode(context=graph.context), start=False), graph.mailbox(String, "result")
+    with pytest.raises(ValueError, match="no first view"):
+        node.start()
+    graph.publish("depth", depth_to_image(np.ones((2, 2), np.float32), 1, "c"), latched=True)
+    graph.spin_for(0.3)
+    assert results == []
+
+
+RUN_A_NODE = """
+import sys
+from active6d_core import node
+from test_node import DepthNode
+
+class Defective(DepthNode):
+    def begin(self):
+        self.create_timer(0.0, self.fail)
+
+    def fail(self):
+        raise ValueError("a defect in the node")
+
+node.run_node(Defective if sys.argv[1] == "defect" else DepthNode)
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["defect"], 1, "Traceback"),
+        (["parameter", "--ros-args", "-p", "gain:=-1.0"], 2, "error: depth_node: parameter 'gain' is -1.0"),
+    ],
+)
+def test_exit_code_two_is_for_parameters_and_a_defect_shows_its_traceback(arguments, code, text):
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(fresh_domain())}
+    environment["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
+    command = [sys.executable, "-c", RUN_A_NODE, *arguments]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == code
+    assert text in ended.stderr
+    assert ("Traceback" in ended.stderr) == (code == 1)
 
 
 def test_latched_inputs_reach_a_node_that_comes_late(graph):

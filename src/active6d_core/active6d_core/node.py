@@ -1,4 +1,4 @@
-"""What every node of the graph shares: lifecycle, checked parameters, guarded inputs, diagnostics, matching of stamps."""
+"""What every node shares: lifecycle, checked parameters, guarded inputs, diagnostics, matching of stamps."""
 
 import signal
 import sys
@@ -108,7 +108,7 @@ class GraphNode(LifecycleNode):
     def input(
         self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool = False
     ) -> Subscription:
-        """A reliable subscription whose callback may raise :class:`MessageError`: the message is refused, the node lives."""
+        """A reliable subscription whose callback may raise :class:`MessageError`: that message is refused, no more."""
 
         def guarded(message: Any) -> None:
             if not self._active:
@@ -173,7 +173,10 @@ class GraphNode(LifecycleNode):
         """Open the outputs, then run :meth:`begin`."""
         super().on_activate(state)
         self._active = True
-        return self._attempt(self.begin)
+        result = self._attempt(self.begin)
+        if result != TransitionCallbackReturn.SUCCESS:
+            self.on_deactivate(state)
+        return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close inputs and outputs."""
@@ -246,17 +249,19 @@ def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> N
     rclpy.init(args=args)
     node = None
     try:
-        node = node_type()
-        if node.autostart:
-            node.start()
+        try:
+            node = node_type()
+            if node.autostart:
+                node.start()
+        # Only here: a ValueError in a callback is a defect, which needs its traceback and the supervisor's restart.
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
     except RuntimeError:
         # An interrupt between the executor's look at the context and its wait ends in rcl's own error.
         if rclpy.ok():
