@@ -10,6 +10,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from hypothesis import given
 from hypothesis import strategies as st
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_harness import fresh_domain
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
@@ -153,6 +154,26 @@ def test_latched_inputs_reach_a_node_that_comes_late(graph):
     graph.add(DepthNode(context=graph.context))
     graph.spin_until_filled([results])
     assert results[0].data == "5.0"
+
+
+class DriverNode(GraphNode):
+    """Listens to a camera that is not this project's."""
+
+    def __init__(self, **kwargs):
+        super().__init__("driver_node", **kwargs)
+        self.stamps = []
+        self.camera_input(Image, "camera/depth", lambda message: self.stamps.append(message.header.stamp.sec), False)
+
+
+@pytest.mark.parametrize("reliability", [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])
+@pytest.mark.parametrize("durability", [DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL])
+def test_every_drivers_quality_of_service_is_matched(graph, reliability, durability):
+    node = graph.add(DriverNode(context=graph.context))
+    qos = QoSProfile(depth=5, reliability=reliability, durability=durability)
+    publisher = graph.node.create_publisher(Image, "camera/depth", qos)
+    graph.spin_until(publisher.get_subscription_count)
+    publisher.publish(depth_to_image(np.ones((2, 2), np.float32), 3_000_000_000, "c"))
+    graph.spin_until(lambda: node.stamps == [3])
 
 
 @given(st.permutations([(stamp, name) for stamp in (1, 2, 3) for name in "abc"]))

@@ -109,7 +109,20 @@ class GraphNode(LifecycleNode):
         self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool = False
     ) -> Subscription:
         """A reliable subscription whose callback may raise :class:`MessageError`: that message is refused, no more."""
+        return self._subscribe(message_type, topic, callback, _qos(latched, depth=_QUEUE_DEPTH))
 
+    def camera_input(
+        self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool
+    ) -> Subscription:
+        """An :meth:`input` from a camera: latched as this project's are, else best effort, which every driver matches."""
+        qos = _qos(latched, depth=_QUEUE_DEPTH)
+        if not latched:
+            qos.reliability = ReliabilityPolicy.BEST_EFFORT
+        return self._subscribe(message_type, topic, callback, qos)
+
+    def _subscribe(
+        self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+    ) -> Subscription:
         def guarded(message: Any) -> None:
             if not self._active:
                 return
@@ -118,9 +131,7 @@ class GraphNode(LifecycleNode):
             except MessageError as error:
                 self.reject(f"{topic}: {error}")
 
-        return self.create_subscription(
-            message_type, topic, guarded, _qos(latched, depth=_QUEUE_DEPTH), qos_overriding_options=_overridable()
-        )
+        return self.create_subscription(message_type, topic, guarded, qos, qos_overriding_options=_overridable())
 
     # Diagnostics
 

@@ -55,7 +55,7 @@ class AttentionPolicyNode(GraphNode):
         self.goal = self.output(PoseStamped, "view_goal")
         self.end = self.output(DiagnosticArray, "episode/end", latched=True)
         self.input(PointCloud2, "objects", self._on_objects, latched=True)
-        self.input(PoseStamped, "camera/pose", self._on_pose, latched=latched)
+        self.camera_input(PoseStamped, "camera/pose", self._on_pose, latched)
         self.input(DiagnosticArray, "episode/start", self._on_start, latched=True)
         self._forget()
 

@@ -70,10 +70,11 @@ class EpisodeRecorderNode(GraphNode):
         return self._writer.missing(stamp)
 
     def _subscribe(self, topic: RecordedTopic) -> Subscription:
-        latched = topic.latched and (self._latched_camera or not topic.name.startswith("camera/"))
+        from_driver = topic.name.startswith("camera/") and not self._latched_camera
+        latched = topic.latched and not from_driver
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_ALL,
-            reliability=ReliabilityPolicy.RELIABLE,
+            reliability=ReliabilityPolicy.BEST_EFFORT if from_driver else ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         package, _, name = topic.type.split("/")

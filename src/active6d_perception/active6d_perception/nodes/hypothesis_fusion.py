@@ -67,9 +67,9 @@ class HypothesisFusionNode(GraphNode):
         self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
         self.input(PointCloud2, "hypotheses", self._on_hypotheses, latched=True)
         self.input(Image, "hypotheses/segmentation", self._on_segmentation, latched=True)
-        self.input(Image, "camera/depth/image_raw", self._on_depth, latched)
-        self.input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
-        self.input(PoseStamped, "camera/pose", self._on_pose, latched)
+        self.camera_input(Image, "camera/depth/image_raw", self._on_depth, latched)
+        self.camera_input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
+        self.camera_input(PoseStamped, "camera/pose", self._on_pose, latched)
 
     def setup(self) -> None:
         """Load the object and precompute its views."""

@@ -45,11 +45,11 @@ class PoseEstimatorNode(GraphNode):
         self._poses = self.output(PoseArray, "hypotheses/poses", latched=True)
         self._segmentation = self.output(Image, "hypotheses/segmentation", latched=True)
         self._views = StampSynchronizer(["color", "depth", "camera"] + ["pose"] * use_pose, self._on_view)
-        self.input(Image, "camera/color/image_raw", self._on_color, latched)
-        self.input(Image, "camera/depth/image_raw", self._on_depth, latched)
-        self.input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
+        self.camera_input(Image, "camera/color/image_raw", self._on_color, latched)
+        self.camera_input(Image, "camera/depth/image_raw", self._on_depth, latched)
+        self.camera_input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
         if use_pose:
-            self.input(PoseStamped, "camera/pose", self._on_pose, latched)
+            self.camera_input(PoseStamped, "camera/pose", self._on_pose, latched)
 
     def setup(self) -> None:
         """Load the object and make the estimator."""
