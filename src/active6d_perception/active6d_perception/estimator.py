@@ -69,4 +69,7 @@ def create_estimator(name: str, model: ObjectModel, **parameters) -> Estimator:
     unknown = sorted(parameters.keys() - set(known))
     if unknown:
         raise ValueError(f"estimator '{name}' has no parameter '{unknown[0]}'; known: {', '.join(known)}")
-    return factory(model, **parameters)
+    try:
+        return factory(model, **parameters)
+    except TypeError as error:
+        raise ValueError(f"estimator '{name}': {error}") from error
