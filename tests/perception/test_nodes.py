@@ -165,6 +165,7 @@ def test_a_view_without_depth_has_no_hypothesis(graph, estimator):
         ({"estimator": "psychic"}, "estimator"),
         ({"estimator_parameters": "[1]"}, "estimator_parameters"),
         ({"estimator_parameters": "{colour: 1}"}, "no parameter 'colour'"),
+        ({"estimator": "geometric", "estimator_parameters": "{min_score: high}"}, "estimator 'geometric': .* 'str'"),
         ({"object": "teapot"}, "unknown object 'teapot'"),
     ],
 )
@@ -238,6 +239,19 @@ def test_the_same_view_again_changes_nothing(graph, fusion, seen):
     graph.spin_until_filled([objects], 2)
     assert bytes(objects[0].data) == bytes(objects[1].data)
     assert objects[0].header == objects[1].header
+
+
+def test_a_node_that_is_configured_again_knows_no_view(graph, fusion, seen):
+    objects = graph.mailbox(PointCloud2, "objects", True)
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
+    send(graph, fusion_messages(seen, 2 * SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects], 2)
+    fusion.trigger_deactivate()
+    fusion.trigger_cleanup()
+    fusion.start()
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects], 3)
+    assert objects_from_cloud(objects[2], "world").support[0] == 1
 
 
 def test_a_new_episode_forgets_the_last(graph, fusion, seen):

@@ -57,12 +57,9 @@ class HypothesisFusionNode(GraphNode):
             ),
         )
         latched = self.declare("latched_camera", True, "camera topics are transient-local, false for plain drivers")
-        self._latest: tuple[int, np.ndarray, PinholeCamera] | None = None
         self._objects = self.output(PointCloud2, "objects", latched=True)
         self._poses = self.output(PoseArray, "objects/poses", latched=True)
         self._markers = self.output(MarkerArray, "objects/markers", latched=True)
-        names = ("hypotheses", "segmentation", "depth", "camera", "pose")
-        self._views = StampSynchronizer(names, self._on_view)
         # First, for the executor calls back in this order: a new episode is known before its first view.
         self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
         self.input(PointCloud2, "hypotheses", self._on_hypotheses, latched=True)
@@ -72,7 +69,9 @@ class HypothesisFusionNode(GraphNode):
         self.camera_input(PoseStamped, "camera/pose", self._on_pose, latched)
 
     def setup(self) -> None:
-        """Load the object and precompute its views."""
+        """Load the object and precompute its views; nothing is known of any view."""
+        self._latest: tuple[int, np.ndarray, PinholeCamera] | None = None
+        self._views = StampSynchronizer(("hypotheses", "segmentation", "depth", "camera", "pose"), self._on_view)
         model = load_object(self._object)
         self._verifier = Verifier(model, self._epsilon, self._samples)
         self._fusion = SceneFusion(model, self._fusion_parameters)

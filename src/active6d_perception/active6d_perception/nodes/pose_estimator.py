@@ -44,7 +44,7 @@ class PoseEstimatorNode(GraphNode):
         self._hypotheses = self.output(PointCloud2, "hypotheses", latched=True)
         self._poses = self.output(PoseArray, "hypotheses/poses", latched=True)
         self._segmentation = self.output(Image, "hypotheses/segmentation", latched=True)
-        self._views = StampSynchronizer(["color", "depth", "camera"] + ["pose"] * use_pose, self._on_view)
+        self._awaited = ["color", "depth", "camera"] + ["pose"] * use_pose
         self.camera_input(Image, "camera/color/image_raw", self._on_color, latched)
         self.camera_input(Image, "camera/depth/image_raw", self._on_depth, latched)
         self.camera_input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
@@ -53,6 +53,7 @@ class PoseEstimatorNode(GraphNode):
 
     def setup(self) -> None:
         """Load the object and make the estimator."""
+        self._views = StampSynchronizer(self._awaited, self._on_view)
         self._estimator = create_estimator(self._name, load_object(self._object), **self._read_settings())
 
     def teardown(self) -> None:
