@@ -40,6 +40,9 @@ def scene(request) -> Scene:
 
 def test_objects_do_not_penetrate_each_other(scene):
     assert deepest_penetration(scene.object_name, scene.T_world_all) < 0.0015
+    squeezed = scene.T_world_all.copy()
+    squeezed[:, :3, 3] *= 0.8
+    assert deepest_penetration(scene.object_name, squeezed) > 0.003  # the measure does see penetration
 
 
 def test_objects_lie_in_the_bin(scene):
