@@ -268,6 +268,21 @@ def test_a_new_episode_forgets_the_last(graph, fusion, seen):
     assert objects_from_cloud(objects[2], "world").support[0] == 1
 
 
+def test_hypotheses_that_come_after_their_episode_are_refused(graph, fusion, seen):
+    objects, diagnostics = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(DiagnosticArray, "/diagnostics")
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS[:-1])
+    start = DiagnosticArray(status=[DiagnosticStatus()])
+    start.header.stamp = ns_to_stamp(2 * SECOND)
+    graph.publish("episode/start", start, latched=True)
+    graph.spin_for(0.2)
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS[-1:])
+    graph.spin_until(lambda: any("older than the episode" in d.status[0].message for d in diagnostics))
+    send(graph, fusion_messages(seen, 2 * SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects])
+    assert [stamp_to_ns(message.header.stamp) for message in objects] == [2 * SECOND]
+    assert objects_from_cloud(objects[0], "world").support[0] == 1
+
+
 def zero_quaternion(messages):
     messages["camera/pose"].pose.orientation.w = 0.0
     for axis in "xyz":

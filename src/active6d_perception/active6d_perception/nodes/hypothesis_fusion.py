@@ -71,6 +71,7 @@ class HypothesisFusionNode(GraphNode):
     def setup(self) -> None:
         """Load the object and precompute its views; nothing is known of any view."""
         self._latest: tuple[int, np.ndarray, PinholeCamera] | None = None
+        self._episode_start = 0
         self._views = StampSynchronizer(("hypotheses", "segmentation", "depth", "camera", "pose"), self._on_view)
         model = load_object(self._object)
         self._verifier = Verifier(model, self._epsilon, self._samples)
@@ -102,12 +103,14 @@ class HypothesisFusionNode(GraphNode):
         self._views.add("pose", stamp_to_ns(message.header.stamp), pose_stamped_to_transform(message, self.world_frame))
 
     def _on_episode_start(self, message: DiagnosticArray) -> None:
-        start = stamp_to_ns(message.header.stamp)
+        start = self._episode_start = stamp_to_ns(message.header.stamp)
         self._fusion.forget_before(start)
         if self._latest is not None and self._latest[0] >= start:
             self._publish()  # the first view overtook the announcement of its episode
 
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
+        if stamp < self._episode_start:  # the estimator was still at it when the scene changed
+            raise MessageError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
         camera, depth, segmentation = values["camera"], values["depth"], values["segmentation"]
         size = (camera.height, camera.width)
         if depth.shape != size or segmentation.shape != size:
