@@ -231,6 +231,16 @@ def test_fusion_publishes_verified_objects(graph, fusion, seen, tmp_path):
     assert (tmp_path / "active6d/meshes/mug.stl").stat().st_size > 1000
 
 
+def test_fusion_hands_the_objects_to_the_detections_too(graph, fusion, seen, monkeypatch):
+    sent = []
+    monkeypatch.setattr(fusion._detections, "publish", lambda *arguments: sent.append(arguments))
+    objects = graph.mailbox(PointCloud2, "objects", True)
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects])
+    found, model, stamp, frame = sent[0]
+    assert (len(found), model.name, stamp, frame) == (1, "mug", SECOND, "world")
+
+
 def test_the_same_view_again_changes_nothing(graph, fusion, seen):
     objects = graph.mailbox(PointCloud2, "objects", True)
     send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)

@@ -26,12 +26,16 @@ from active6d_core.conversions import (
 )
 from active6d_core.node import GraphNode, StampSynchronizer, run_node
 from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.optional_outputs import DetectionOutput
 from active6d_perception.fusion import FusionParameters, SceneFusion
 from active6d_perception.verification import Verifier
 
 
 class HypothesisFusionNode(GraphNode):
-    """Hypotheses with masks, depth and camera pose in; ``objects``, ``objects/poses`` and ``objects/markers`` out."""
+    """Hypotheses with masks, depth and camera pose in; ``objects``, ``objects/poses`` and ``objects/markers`` out.
+
+    Where vision_msgs is installed, the objects also go out as ``objects/detections``.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("hypothesis_fusion", **options)
@@ -60,6 +64,7 @@ class HypothesisFusionNode(GraphNode):
         self._objects = self.output(PointCloud2, "objects", latched=True)
         self._poses = self.output(PoseArray, "objects/poses", latched=True)
         self._markers = self.output(MarkerArray, "objects/markers", latched=True)
+        self._detections = DetectionOutput(self, "objects/detections")
         # First, for the executor calls back in this order: a new episode is known before its first view.
         self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
         self.input(PointCloud2, "hypotheses", self._on_hypotheses, latched=True)
@@ -73,10 +78,10 @@ class HypothesisFusionNode(GraphNode):
         self._latest: tuple[int, np.ndarray, PinholeCamera] | None = None
         self._episode_start = 0
         self._views = StampSynchronizer(("hypotheses", "segmentation", "depth", "camera", "pose"), self._on_view)
-        model = load_object(self._object)
-        self._verifier = Verifier(model, self._epsilon, self._samples)
-        self._fusion = SceneFusion(model, self._fusion_parameters)
-        self._mesh_uri = export_mesh(model)
+        self._model = load_object(self._object)
+        self._verifier = Verifier(self._model, self._epsilon, self._samples)
+        self._fusion = SceneFusion(self._model, self._fusion_parameters)
+        self._mesh_uri = export_mesh(self._model)
 
     def _on_hypotheses(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
@@ -131,6 +136,7 @@ class HypothesisFusionNode(GraphNode):
         self._objects.publish(objects_to_cloud(objects, stamp, self.world_frame))
         self._poses.publish(poses_to_array(objects.T_world_object, stamp, self.world_frame))
         self._markers.publish(objects_to_markers(objects, self._mesh_uri, stamp, self.world_frame))
+        self._detections.publish(objects, self._model, stamp, self.world_frame)
 
 
 def export_mesh(model: ObjectModel) -> str:
