@@ -4,22 +4,20 @@
 a JSON of the configuration beside it, so loading weights executes nothing.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
 from torch import nn
 
 from active6d_agent.environment import MAX_OBJECTS
 from active6d_agent.policy import Decision, Observation, register_policy
+from active6d_agent.weights_file import load_weights, save_weights, shipped_weights
 from active6d_core.object_model import ObjectModel
 
 #: What a state consists of beside the history: o_t (12) and the camera's position (3).
 _STATE = 15
 _FEATURES = 6
-SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
 
 
 class ObjectAttention(nn.Module):
@@ -90,10 +88,7 @@ class AttentionNetwork(nn.Module):
 
 def save_network(network: AttentionNetwork, path: Path, provenance: dict | None = None) -> None:
     """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_file({name: value.contiguous() for name, value in network.state_dict().items()}, path)
-    config = {"policy": "attention", "steps": network.steps, "hidden": network.hidden, "provenance": provenance or {}}
-    path.with_suffix(".json").write_text(json.dumps(config, indent=2) + "\n")
+    save_weights(network, path, "attention", {"steps": network.steps, "hidden": network.hidden}, provenance)
 
 
 def load_network(path: Path) -> AttentionNetwork:
@@ -102,18 +97,7 @@ def load_network(path: Path) -> AttentionNetwork:
     Raises:
         ValueError: a file is missing, damaged or does not fit; the message names it.
     """
-    try:
-        config = json.loads(path.with_suffix(".json").read_text())
-        if config["policy"] != "attention":
-            raise ValueError(f"these are weights of policy '{config['policy']}'")
-        network = AttentionNetwork(int(config["steps"]), int(config["hidden"]))
-        network.load_state_dict(load_file(path))
-    except Exception as error:  # safetensors and torch raise their own kinds
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(
-            f"{path}: no weights of the attention policy ({reason}); see 'active6d train policy'"
-        ) from error
-    return network.eval()
+    return load_weights(path, "attention", lambda config: AttentionNetwork(config["steps"], config["hidden"]))
 
 
 @register_policy("attention")
@@ -129,9 +113,7 @@ class AttentionPolicy:
     """
 
     def __init__(self, model: ObjectModel, weights: str = "") -> None:
-        self.network = load_network(
-            Path(weights) if weights else SHIPPED_WEIGHTS / f"attention_{model.name}.safetensors"
-        )
+        self.network = load_network(Path(weights) if weights else shipped_weights("attention", model.name))
 
     def reset(self, rng: np.random.Generator) -> None:
         """The mean is taken, so nothing is random here."""

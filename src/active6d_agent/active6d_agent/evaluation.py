@@ -62,7 +62,6 @@ def run_policy(
         allowed: (M,) bool, views in reach, all when None.
         metres: budget of each episode.
     """
-    allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
     scene = starts[:, 0]
     views = np.full((len(starts), steps + 1), -1)
     views[:, 0] = starts[:, 1]
@@ -73,17 +72,44 @@ def run_policy(
     for step in range(steps):
         if not len(running):
             break
-        current = views[running, step]
-        fused = lookup.fuse(scene[running], views[running], current)
-        described = lookup.describe(fused, scene[running], current)
-        for episode, objects in zip(running, described, strict=True):
-            positions = lookup.sphere.positions[views[episode, : step + 1]]
-            left = metres - lookup.sphere.path_length(positions)
-            observation = Observation(objects, positions, lookup.sphere, allowed, steps - step, left)
+        left = np.full(len(running), steps - step)
+        observations = observe(lookup, scene[running], views[running], left, allowed=allowed, metres=metres)
+        for episode, observation in zip(running, observations, strict=True):
             decision = policies[episode].decide(observation)
             views[episode, step + 1] = -1 if decision.stop else decision.view
         running = running[views[running, step + 1] >= 0]
     return measure(lookup, scene, views)
+
+
+def observe(
+    lookup: BankLookup,
+    scene: np.ndarray,
+    views: np.ndarray,
+    left: np.ndarray,
+    *,
+    allowed: np.ndarray | None = None,
+    metres: float = np.inf,
+) -> list[Observation]:
+    """What a policy sees after (E, v) views, -1 padding at the end, with (E,) moves left.
+
+    Args:
+        lookup: of the bank.
+        scene: (E,) indices.
+        views: taken so far, at least one.
+        left: of the budget.
+        allowed: (M,) bool, views in reach, all when None.
+        metres: budget of each episode from its beginning.
+    """
+    allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
+    count = (views >= 0).sum(axis=1)
+    current = views[np.arange(len(views)), count - 1]
+    described = lookup.describe(lookup.fuse(scene, views, current), scene, current)
+    observations = []
+    for objects, taken, number, moves in zip(described, views, count, left, strict=True):
+        positions = lookup.sphere.positions[taken[:number]]
+        metres_left = metres - lookup.sphere.path_length(positions)
+        observations.append(Observation(objects, positions, lookup.sphere, allowed, int(moves), metres_left))
+    return observations
 
 
 def measure(lookup: BankLookup, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:

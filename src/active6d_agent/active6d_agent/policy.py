@@ -106,6 +106,7 @@ _registry: dict[str, Callable[..., Policy]] = {}
 _MODULES = {
     "active6d_agent.baselines": ("random", "unidirectional", "max-distance", "lowest-score", "single-view", "entropy"),
     "active6d_agent.attention": ("attention",),
+    "active6d_agent.view_attention": ("view-attention",),
 }
 
 

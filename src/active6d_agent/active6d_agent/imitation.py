@@ -1,0 +1,369 @@
+"""Training ``view-attention`` on a scene bank: imitate what the truth says of every view, then improve on it.
+
+The oracle of a bank says for every candidate view what it would gain, so one visited state teaches a hundred values.
+States are those that the learner itself comes to (DAgger), with some random moves and budgets of every length. In the
+second part of the training the learner also plays its own moves to the end from several candidates of each state, and
+learns what each leaves to be gained: one step of policy iteration a round.
+"""
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from active6d_agent.evaluation import all_starts, measure, observe
+from active6d_agent.lookup import BankLookup
+from active6d_agent.oracle import tally
+from active6d_agent.policy import Observation
+from active6d_agent.view_attention import (
+    GAINS,
+    ViewAttention,
+    Weighing,
+    encode,
+    load_network,
+    new_network,
+    save_network,
+    value_views,
+)
+
+# Episodes that the network values together: more are no faster and need memory.
+_TOGETHER = 64
+
+
+@dataclass(frozen=True)
+class ImitationParameters:
+    """How to train.
+
+    Attributes:
+        steps: horizon T of validation.
+        longest: training episodes have 1 to this many moves.
+        rounds: of collecting states and learning from all of them.
+        episodes: of each round.
+        updates: steps of the optimiser each round.
+        batch: states per step.
+        views: of each state that one step learns from.
+        learning_rate: of Adam at first; falls to nothing along a cosine.
+        explore: share of random moves.
+        improve_after: share of the rounds after which later gains are rolled out.
+        rollouts: candidates per state to roll out.
+        capacity: states kept, the latest.
+        starts: validation episodes.
+        evaluate_every: rounds between validations.
+        hidden: width of the network.
+        seed: of everything.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+
+    steps: int = 5
+    longest: int = 8
+    rounds: int = 80
+    episodes: int = 32
+    updates: int = 50
+    batch: int = 96
+    views: int = 32
+    learning_rate: float = 2e-3
+    explore: float = 0.2
+    improve_after: float = 0.4
+    rollouts: int = 6
+    capacity: int = 12_000
+    starts: int = 150
+    evaluate_every: int = 5
+    hidden: int = 48
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("explore", "improve_after"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"training: {name} must be in [0, 1], got {getattr(self, name)}")
+        for name in asdict(self).keys() - {"explore", "improve_after", "learning_rate", "seed"}:
+            if getattr(self, name) < 1:
+                raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"training: learning_rate must be positive, got {self.learning_rate}")
+
+
+@dataclass(frozen=True)
+class ImitationProgress:
+    """One line of the curve.
+
+    Attributes:
+        round: rounds done.
+        seconds: of training so far.
+        states: labelled so far.
+        loss: mean of the round.
+        detection_rate: on the validation scenes.
+        e_add_mm: there.
+        distance_m: there.
+    """
+
+    round: int
+    seconds: float
+    states: int
+    loss: float
+    detection_rate: float
+    e_add_mm: float
+    distance_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One state and what its views gain.
+
+    Attributes:
+        observation: the state.
+        now: (M, 2) gains of each view, NaN for those that are no candidates.
+        later: (M, 2) gains of the learner's moves after it, NaN where they were not played.
+    """
+
+    observation: Observation
+    now: np.ndarray
+    later: np.ndarray
+
+
+def imitate(
+    train: BankLookup,
+    validation: BankLookup,
+    folder: Path,
+    parameters: ImitationParameters | None = None,
+    weighing: Weighing | None = None,
+    *,
+    resume: bool = False,
+) -> Iterator[ImitationProgress]:
+    """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
+
+    ``folder`` receives ``curve.jsonl``, ``best.safetensors`` (highest validation detection rate, lower e_ADD of equals)
+    and ``latest.safetensors``, each with its JSON.
+
+    Args:
+        train: scenes to train on.
+        validation: scenes to choose the best on.
+        folder: of the results.
+        parameters: how to train.
+        weighing: what counts for the learner.
+        resume: go on from ``latest`` with newly collected states.
+
+    Raises:
+        ValueError: there is nothing to resume from.
+    """
+    parameters, weighing = parameters or ImitationParameters(), weighing or Weighing()
+    folder.mkdir(parents=True, exist_ok=True)
+    learner = _Learner(train, parameters, weighing)
+    curve, latest, best, begun = folder / "curve.jsonl", folder / "latest.safetensors", (-1.0, 0.0), time.perf_counter()
+    if resume:
+        best, seconds = learner.restore(latest)
+        begun -= seconds
+    else:
+        curve.unlink(missing_ok=True)
+    starts = all_starts(validation, parameters.starts, parameters.seed)
+    while learner.round < parameters.rounds:
+        loss = learner.advance()
+        if learner.round % parameters.evaluate_every and learner.round < parameters.rounds:
+            continue
+        measured = validate(learner.network, validation, starts, parameters.steps)
+        progress = ImitationProgress(learner.round, time.perf_counter() - begun, learner.states, loss, *measured)
+        with curve.open("a") as file:
+            file.write(json.dumps(asdict(progress)) + "\n")
+        made = {"parameters": asdict(parameters), "progress": asdict(progress), "bank": train.bank.provenance}
+        if (progress.detection_rate, -progress.e_add_mm) > best:
+            best = (progress.detection_rate, -progress.e_add_mm)
+            save_network(learner.network, folder / "best.safetensors", train.model.name, made)
+        save_network(learner.network, latest, train.model.name, {**made, "best": best})
+        yield progress
+
+
+def validate(network: ViewAttention, lookup: BankLookup, starts: np.ndarray, steps: int) -> tuple[float, float, float]:
+    """Detection rate, e_ADD (mm) and metres of the network's moves from (E, 2) starts."""
+    views = np.full((len(starts), steps + 1), -1)
+    views[:, 0] = starts[:, 1]
+    played = roll_out(lookup, greedy(network), starts[:, 0], views, np.full(len(starts), steps))
+    result = measure(lookup, starts[:, 0], played)
+    return float(result.detection_rate.mean()), float(result.e_add_mm.mean()), float(result.distance_m.mean())
+
+
+def greedy(network: ViewAttention) -> Callable[[list[Observation]], np.ndarray]:
+    """Observations to (B,) views of most worth."""
+    return lambda observations: _worths(network, observations).argmax(axis=1)
+
+
+def _worths(network: ViewAttention, observations: list[Observation]) -> np.ndarray:
+    """(B, M) worth of every view by what the network weighs."""
+    parts = [observations[start : start + _TOGETHER] for start in range(0, len(observations), _TOGETHER)]
+    return np.concatenate([value_views(network, part, network.weighing).worth for part in parts])
+
+
+def roll_out(
+    lookup: BankLookup,
+    choose: Callable[[list[Observation]], np.ndarray],
+    scene: np.ndarray,
+    views: np.ndarray,
+    left: np.ndarray,
+) -> np.ndarray:
+    """Play E episodes to their ends.
+
+    Args:
+        lookup: of the bank.
+        choose: observations to (B,) views.
+        scene: (E,) indices.
+        views: (E, v) taken so far, -1 padding at the end, with room for the rest.
+        left: (E,) moves left.
+
+    Returns:
+        (E, v) all views taken.
+    """
+    views, left = views.copy(), left.copy()
+    while (running := np.flatnonzero(left > 0)).size:
+        count = (views[running] >= 0).sum(axis=1)
+        views[running, count] = choose(observe(lookup, scene[running], views[running], left[running]))
+        left[running] -= 1
+    return views
+
+
+def candidate_gains(lookup: BankLookup, scene: int, views: np.ndarray) -> np.ndarray:
+    """(M, 2) what each view adds to the (v,) views taken (:func:`~active6d_agent.oracle.tally`), NaN for those."""
+    free = np.setdiff1d(np.arange(len(lookup.sphere)), views)
+    paths = np.column_stack([np.tile(views, (len(free) + 1, 1)), np.append(free, views[-1])])
+    known = tally(lookup, np.full(len(paths), scene), paths)
+    gains = np.full((len(lookup.sphere), GAINS), np.nan)
+    gains[free] = known[:-1] - known[-1]
+    return gains
+
+
+class _Learner:
+    """The network, its optimiser and the states that it learns from."""
+
+    def __init__(self, lookup: BankLookup, parameters: ImitationParameters, weighing: Weighing) -> None:
+        torch.manual_seed(parameters.seed)
+        self.lookup, self.parameters, self._weighing = lookup, parameters, weighing
+        self.network = new_network(lookup.model, parameters.hidden)
+        self.network.weighing = replace(weighing, lookahead=0.0)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), parameters.learning_rate, weight_decay=1e-5)
+        self.rng = np.random.default_rng(parameters.seed)
+        self.memory: deque[Example] = deque(maxlen=parameters.capacity)
+        self.round, self.states = 0, 0
+
+    @property
+    def improves(self) -> bool:
+        """Whether later gains are played out by now."""
+        return self.round >= self.parameters.improve_after * self.parameters.rounds
+
+    def restore(self, path: Path) -> tuple[tuple[float, float], float]:
+        """Take the weights of an earlier training; the best so far and the seconds spent."""
+        known = load_network(path, self.lookup.model.name)
+        self.network.load_state_dict(known.state_dict())
+        self.network.weighing = known.weighing
+        provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
+        progress = provenance["progress"]
+        self.round, self.states = progress["round"], progress["states"]
+        # The same scenes again would be the seed's; go on with others.
+        self.rng = np.random.default_rng([self.parameters.seed, self.round])
+        return tuple(provenance["best"]), progress["seconds"]
+
+    def advance(self) -> float:
+        """One round; its mean loss."""
+        self._collect()
+        if self.improves:
+            self.network.weighing = self._weighing  # later gains count once they are learned
+        share = self.round / self.parameters.rounds
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.parameters.learning_rate * (0.02 + 0.98 * (1 + np.cos(np.pi * share)) / 2)
+        self.network.train()
+        loss = float(np.mean([self._update() for _ in range(self.parameters.updates)]))
+        self.network.eval()
+        self.round += 1
+        return loss
+
+    def _collect(self) -> None:
+        """Play episodes as the learner does now, and label every state on the way."""
+        lookup, rng, count = self.lookup, self.rng, self.parameters.episodes
+        scene = rng.integers(len(lookup.bank.scenes), size=count)
+        left = rng.integers(1, self.parameters.longest + 1, size=count)
+        views = np.full((count, self.parameters.longest + 1), -1)
+        views[:, 0] = rng.integers(len(lookup.sphere), size=count)
+        # The oracle leads until the learner has learned something.
+        lead = max(0.0, 1.0 - 5.0 * self.round / self.parameters.rounds)
+
+        def choose(observations: list[Observation]) -> np.ndarray:
+            running = np.flatnonzero(left > 0)
+            values = _worths(self.network, observations)
+            nows = [candidate_gains(lookup, s, v[v >= 0]) for s, v in zip(scene[running], views[running], strict=True)]
+            laters = self._play_out(observations, scene[running], views[running], nows, values)
+            self.memory.extend(map(Example, observations, nows, laters))
+            self.states += len(observations)
+            weigh = [1.0, self._weighing.error_weight]
+            best = [self._best(now @ weigh, worth, lead) for now, worth in zip(nows, values, strict=True)]
+            views[running, (views[running] >= 0).sum(axis=1)] = best
+            left[running] -= 1
+            return np.array(best)
+
+        roll_out(lookup, choose, scene, views, left)
+
+    def _best(self, truth: np.ndarray, worth: np.ndarray, lead: float) -> int:
+        """The next view of a training episode."""
+        if self.rng.random() < self.parameters.explore:
+            return int(self.rng.choice(np.flatnonzero(np.isfinite(worth))))
+        return int(np.nanargmax(truth) if self.rng.random() < lead else worth.argmax())
+
+    def _play_out(
+        self, observations: list[Observation], scene: np.ndarray, views: np.ndarray, nows: list, values: np.ndarray
+    ) -> list[np.ndarray]:
+        """(M, 2) later gains per state: of the most valued views, and of as many drawn ones."""
+        laters = [np.full_like(now, np.nan) for now in nows]
+        wanted = [
+            (state, view)
+            for state, (observation, worth) in enumerate(zip(observations, values, strict=True))
+            if self.improves and observation.steps_left > 1
+            for view in self._to_play(worth)
+        ]
+        if not wanted:
+            return laters
+        state, view = np.array(wanted).T
+        left = np.array([observations[index].steps_left - 1 for index in state])
+        after = np.column_stack([views[state], np.full(len(state), -1)])
+        after[np.arange(len(state)), (after >= 0).sum(axis=1)] = view
+        ended = roll_out(self.lookup, greedy(self.network), scene[state], after, left)
+        gained = tally(self.lookup, scene[state], ended) - tally(self.lookup, scene[state], after)
+        for index, of, gain in zip(state, view, gained, strict=True):
+            laters[index][of] = gain
+        return laters
+
+    def _to_play(self, worth: np.ndarray) -> np.ndarray:
+        candidates = np.flatnonzero(np.isfinite(worth))
+        ranked = candidates[np.argsort(-worth[candidates], kind="stable")]
+        top = ranked[: (self.parameters.rollouts + 1) // 2]
+        rest = ranked[len(top) :]
+        return np.append(top, self.rng.permutation(rest)[: self.parameters.rollouts - len(top)])
+
+    def _update(self) -> float:
+        drawn = [self.memory[i] for i in self.rng.integers(len(self.memory), size=self.parameters.batch)]
+        state = encode([example.observation for example in drawn])
+        some = self.rng.permutation(len(self.lookup.sphere))[: self.parameters.views]
+        if self.improves:
+            # Few views of a state were played out; learn from those of every state.
+            played = [np.flatnonzero(np.isfinite(example.later[:, 0])) for example in drawn]
+            some = np.unique(np.concatenate([some, *(self.rng.permutation(each)[:1] for each in played)]).astype(int))
+        state["views"] = state["views"][some]
+        now, later, _ = self.network(state)
+        loss = _loss(now, np.stack([example.now[some] for example in drawn]))
+        loss = loss + _loss(later, np.stack([example.later[some] for example in drawn]))
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimizer.step()
+        return float(loss.detach())
+
+
+def _loss(predicted: torch.Tensor, truth: np.ndarray) -> torch.Tensor:
+    """Square error of (B, M, 2) gains where they are known; differences between the views of a state count most."""
+    target = torch.from_numpy(truth.astype(np.float32))
+    known = torch.isfinite(target)
+    off = torch.where(known, predicted - torch.nan_to_num(target), 0.0)
+    level = off.sum(dim=1) / known.sum(dim=1).clamp(min=1)
+    about = torch.where(known, off - level[:, None], 0.0)
+    return (about**2).sum() / known.sum().clamp(min=1) + 0.25 * (level**2).mean()

@@ -1,0 +1,357 @@
+"""A policy that scores every view against the set of all objects: ``view-attention`` in the registry.
+
+A Gaussian over two angles cannot say "either of these two gaps". Here every view of the grid is valued by itself:
+it looks at all accumulated objects (cross-attention) through what a robot knows of each pair, which is geometry
+between poses: how free the line of sight is past the other objects, from which side of the object it comes, how new
+that side is after the views already taken. Everything is relative, so turning the world about the vertical axis turns
+the answer with it; the order and the number of objects do not matter.
+
+The network predicts what a view gains at once and what can still be gained after it. Training is in
+:mod:`active6d_agent.imitation`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from active6d_agent.policy import Decision, Observation, register_policy
+from active6d_agent.weights_file import load_weights, save_weights, shipped_weights
+from active6d_core.object_model import ObjectModel
+
+#: Objects beyond these are left out, the best verified being kept.
+MAX_OBJECTS = 64
+#: Gains are told as objects newly detected, and as the fall of the summed e_ADD over 50 mm.
+GAINS = 2
+_OBJECT_FEATURES = 14
+_PAIR_FEATURES = 12
+_VIEW_FEATURES = 8
+# A hypothesis closer than this fraction of the diameter is the same object, so it hides nothing.
+_SAME_OBJECT = 0.25
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """What counts.
+
+    Attributes:
+        metres_weight: objects that must be gained for a metre on the way.
+        error_weight: of the fall of the summed error over 50 mm, against one object detected.
+        lookahead: in [0, 1], weight of what the moves after the next will gain.
+
+    Raises:
+        ValueError: a weight is out of range.
+    """
+
+    metres_weight: float = 0.1
+    error_weight: float = 0.5
+    lookahead: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("metres_weight", "error_weight"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}, must be finite and not negative")
+        if not 0 <= self.lookahead <= 1:
+            raise ValueError(f"lookahead is {self.lookahead}, must be in [0, 1]")
+
+
+def best_verified(observation: Observation) -> np.ndarray:
+    """Indices of the objects that are looked at: all, or of many the best verified."""
+    return np.argsort(-observation.objects.verification, kind="stable")[:MAX_OBJECTS]
+
+
+def encode(observations: Sequence[Observation]) -> dict[str, torch.Tensor]:
+    """Padded tensors of B observations on one grid.
+
+    Returns:
+        ``pose`` (B, n, 3, 4) objects in the world, ``scalars`` (B, n, 4) verification, score, spread in metres and
+        share of the views that support the object, ``present`` (B, n), ``taken`` (B, t, 3) positions so far, at the end
+        the current one, repeated, ``moves`` (B,) moves made, ``left`` (B,) moves left, ``views`` (M, 3).
+    """
+    count = max(1, max(min(len(each.objects), MAX_OBJECTS) for each in observations))
+    longest = max(len(each.positions) for each in observations)
+    B = len(observations)
+    pose, scalars = np.zeros((B, count, 3, 4), np.float32), np.zeros((B, count, 4), np.float32)
+    present, taken = np.zeros((B, count), bool), np.zeros((B, longest, 3), np.float32)
+    for row, each in enumerate(observations):
+        objects, t = each.objects, len(each.positions)
+        n = min(len(objects), MAX_OBJECTS)
+        best = best_verified(each)
+        pose[row, :n] = objects.T_world_object[best, :3]
+        columns = (objects.verification, objects.score, objects.spread, objects.support / t)
+        scalars[row, :n] = np.column_stack(columns)[best]
+        present[row, :n] = True
+        taken[row, :t], taken[row, t:] = each.positions, each.positions[-1]
+    arrays = {
+        "pose": pose,
+        "scalars": scalars,
+        "present": present,
+        "taken": taken,
+        "moves": np.array([len(each.positions) - 1 for each in observations], np.float32),
+        "left": np.array([each.steps_left for each in observations], np.float32),
+        "views": observations[0].sphere.positions.astype(np.float32),
+    }
+    return {name: torch.from_numpy(values) for name, values in arrays.items()}
+
+
+class ViewAttention(nn.Module):
+    """Values of all views.
+
+    Args:
+        diameter: of the object, metres.
+        axis: (3,) unit axis of a continuous symmetry, None without one.
+        hidden: width.
+        weighing: what counted when it was validated.
+    """
+
+    def __init__(
+        self, diameter: float, axis: Sequence[float] | None = None, hidden: int = 48, weighing: Weighing = Weighing()
+    ) -> None:
+        super().__init__()
+        self.diameter, self.axis, self.hidden, self.weighing = diameter, axis, hidden, weighing
+        self.of_object = nn.Sequential(nn.Linear(_OBJECT_FEATURES, hidden), nn.ReLU())
+        self.in_context = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.ReLU())
+        self.of_pair = nn.Linear(_PAIR_FEATURES, hidden)
+        self.pair_from_object = nn.Linear(hidden, hidden, bias=False)
+        self.pair_from_view = nn.Linear(_VIEW_FEATURES, hidden, bias=False)
+        self.mix = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU())
+        self.attend = nn.Linear(hidden, 1)
+        self.per_object = nn.Linear(hidden, 2 * GAINS)
+        self.per_view = nn.Sequential(
+            nn.Linear(3 * hidden + _VIEW_FEATURES, hidden), nn.ReLU(), nn.Linear(hidden, 2 * GAINS)
+        )
+
+    def forward(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Value all views.
+
+        Args:
+            state: of :func:`encode`.
+
+        Returns:
+            (B, M, 2) gains of going there next; (B, M, 2) gains of the moves after that, zero where none are left;
+            (B, M, n) each view's attention to the objects.
+        """
+        present = state["present"]
+        objects, pairs, views = self.describe(state)
+        h = self.of_object(objects)
+        count = present.sum(dim=1).clamp(min=1)[:, None]
+        pooled = (h * present[..., None]).sum(dim=1) / count
+        h = self.in_context(torch.cat([h, pooled[:, None].expand_as(h)], dim=-1))
+        together = self.of_pair(pairs) + self.pair_from_object(h)[:, None] + self.pair_from_view(views)[:, :, None]
+        e = torch.relu(together)
+        e = (e + self.mix(e)) * present[:, None, :, None]
+        logits = self.attend(e)[..., 0].masked_fill(~present[:, None], -1e9)
+        attention = torch.softmax(logits, dim=-1) * present[:, None]
+        attended = torch.einsum("bmn,bmnh->bmh", attention, e)
+        # Gains of different objects add up; what nobody has seen yet is for the view as a whole to say.
+        gains = (self.per_object(e) * present[:, None, :, None]).sum(dim=2)
+        mean = e.sum(dim=2) / count[:, None]
+        whole = torch.cat([attended, mean, pooled[:, None].expand_as(attended), views], dim=-1)
+        gains = gains + self.per_view(whole)
+        more = (state["left"] > 1)[:, None, None]
+        return gains[..., :GAINS], gains[..., GAINS:] * more, attention
+
+    def describe(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What is known of (B, n, 14) objects, (B, M, n, 12) pairs and (B, M, 8) views; none of it names a direction
+        of the world but the vertical."""
+        pose, present, taken, grid = state["pose"], state["present"], state["taken"], state["views"]
+        rotation, centre = pose[..., :3], pose[..., 3]
+        B, M = len(pose), len(grid)
+        radius = torch.linalg.vector_norm(taken[:, -1], dim=-1)[:, None, None]
+        cameras = torch.cat([grid.expand(B, M, 3), taken], dim=1)
+        rays = cameras[:, :, None] - centre[:, None]
+        distance = torch.linalg.vector_norm(rays, dim=-1)
+        rays = rays / distance[..., None].clamp(min=1e-6)
+        free, clear = self._sight(rays, centre, present)
+        new, old = rays[:, :M], rays[:, M:]
+        turned = torch.einsum("bmik,btik->bmti", new, old)
+        closest = turned.amax(dim=2).clamp(-1.0, 1.0)
+        seen_there = (free[:, None, M:] * (1.0 + turned) / 2).amax(dim=2)
+        sides = self._sides(torch.einsum("bnij,bmni->bmnj", rotation, new))
+        outward = centre[..., :2] / torch.linalg.vector_norm(centre[..., :2], dim=-1, keepdim=True).clamp(min=1e-6)
+        ahead = -torch.nn.functional.normalize(grid, dim=-1)
+        columns = [
+            free[:, :M],
+            clear[:, :M],
+            new[..., 2],
+            torch.acos(closest * 0.999999) / np.pi,
+            closest,
+            seen_there,
+            distance[:, :M] / radius - 1.0,
+            (new[..., :2] * outward[:, None]).sum(dim=-1),
+            -(new * ahead[None, :, None]).sum(dim=-1) - 0.95,
+        ]
+        pairs = torch.cat([torch.stack(columns, dim=-1), sides], dim=-1)
+        objects = self._describe_objects(state, free[:, M:].amax(dim=1), clear[:, -1])
+        return objects, pairs, self._describe_views(state, radius[:, 0])
+
+    def _sight(self, rays: torch.Tensor, centre: torch.Tensor, present: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """How free (B, K, n, 3) rays from objects to cameras are past the other objects: (B, K, n) twice, once for
+        balls with the diameter and once for their cores."""
+        apart = centre[:, None] - centre[:, :, None]
+        square = (apart**2).sum(dim=-1)
+        hides = present[:, None, :] & (square > (_SAME_OBJECT * self.diameter) ** 2)
+        along = torch.einsum("bkid,bijd->bkij", rays, apart)
+        beside = torch.sqrt((square[:, None] - along**2).clamp(min=0.0)) / self.diameter
+        before = hides[:, None] & (along > 0)
+        free = torch.where(before, beside.clamp(max=1.0), 1.0).prod(dim=-1)
+        clear = torch.where(before, (2 * beside).clamp(max=1.0), 1.0).prod(dim=-1)
+        return free, clear
+
+    def _sides(self, directions: torch.Tensor) -> torch.Tensor:
+        """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
+        if self.axis is None:
+            return directions
+        axial = directions @ torch.tensor(self.axis, dtype=directions.dtype, device=directions.device)
+        return torch.stack([axial, (1 - axial**2).clamp(min=0.0).sqrt(), torch.zeros_like(axial)], dim=-1)
+
+    def _describe_objects(
+        self, state: dict[str, torch.Tensor], best_sight: torch.Tensor, sight_now: torch.Tensor
+    ) -> torch.Tensor:
+        pose, scalars, present = state["pose"], state["scalars"], state["present"]
+        centre = pose[..., 3] / self.diameter
+        up = self._sides(pose[..., 2, :3])
+        apart = centre[:, None] - centre[:, :, None]
+        near = torch.exp(-(apart**2).sum(dim=-1)) * present[:, None]
+        above = (near * apart[..., 2].clamp(min=0.0)).sum(dim=-1)
+        columns = [
+            scalars[..., 0],
+            scalars[..., 1],
+            (scalars[..., 2] / self.diameter).clamp(max=1.0),
+            scalars[..., 3],
+            centre[..., 2],
+            torch.linalg.vector_norm(centre[..., :2], dim=-1) / 2,
+            near.sum(dim=-1) / 3,
+            above,
+            best_sight,
+            sight_now,
+            (state["moves"] / 5).clamp(max=2.0)[:, None].expand_as(best_sight),
+        ]
+        return torch.cat([torch.stack(columns, dim=-1), up], dim=-1)
+
+    def _describe_views(self, state: dict[str, torch.Tensor], radius: torch.Tensor) -> torch.Tensor:
+        grid = torch.nn.functional.normalize(state["views"], dim=-1)
+        taken = torch.nn.functional.normalize(state["taken"], dim=-1)
+        arcs = torch.acos((torch.einsum("md,btd->bmt", grid, taken)).clamp(-1, 1) * 0.999999) / np.pi
+        height, level = grid[:, 2].expand(arcs.shape[:2]), taken[:, -1, 2:3].expand(arcs.shape[:2])
+        moves = (state["moves"] / 5).clamp(max=2.0)[:, None].expand_as(height)
+        left = (state["left"] / 5).clamp(max=2.0)[:, None].expand_as(height)
+        count = (state["present"].sum(dim=1) / 20.0)[:, None].expand_as(height)
+        columns = [height, level, arcs[..., -1], arcs.amin(dim=-1), moves, left, count, 1.0 / (1.0 + 5 * left)]
+        return torch.stack(columns, dim=-1)
+
+
+def save_network(network: ViewAttention, path: Path, object_name: str, provenance: dict | None = None) -> None:
+    """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
+    axis = None if network.axis is None else [float(value) for value in network.axis]
+    config = {
+        "object": object_name,
+        "diameter": float(network.diameter),
+        "axis": axis,
+        "hidden": network.hidden,
+        "weighing": asdict(network.weighing),
+    }
+    save_weights(network, path, "view-attention", config, provenance)
+
+
+def load_network(path: Path, object_name: str) -> ViewAttention:
+    """Read what :func:`save_network` wrote.
+
+    Raises:
+        ValueError: a file is missing, damaged, of another object or does not fit; the message names it.
+    """
+
+    def build(config: dict) -> ViewAttention:
+        if config["object"] != object_name:
+            raise ValueError(f"these are weights for '{config['object']}', not for '{object_name}'")
+        return ViewAttention(config["diameter"], config["axis"], config["hidden"], Weighing(**config["weighing"]))
+
+    return load_weights(path, "view-attention", build)
+
+
+def new_network(model: ObjectModel, hidden: int = 48) -> ViewAttention:
+    """An untrained network for an object."""
+    axis = model.symmetry.axis
+    return ViewAttention(float(model.diameter), None if axis is None else axis.tolist(), hidden)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewValues:
+    """Of B observations.
+
+    Attributes:
+        worth: (B, M) of going to each view next, ``-inf`` where it is no candidate.
+        gain: (B, M) expected of it and all later moves, ``-inf`` likewise.
+        attention: (B, M, n) of each view to the objects that :func:`encode` keeps.
+    """
+
+    worth: np.ndarray
+    gain: np.ndarray
+    attention: np.ndarray
+
+
+def value_views(network: ViewAttention, observations: Sequence[Observation], weighing: Weighing) -> ViewValues:
+    """Value every view of every observation."""
+    with torch.inference_mode():
+        now, later, attention = (values.double().numpy() for values in network(encode(observations)))
+    candidates = np.stack([each.candidates() for each in observations])
+    arcs = np.stack([each.sphere.arc(each.sphere.positions, each.positions[-1]) for each in observations])
+    weigh = np.array([1.0, weighing.error_weight])
+    worth = (now + weighing.lookahead * later) @ weigh - weighing.metres_weight * arcs
+    # Views of equal value differ by rounding, which must not decide.
+    worth = np.where(candidates, np.round(worth, 5), -np.inf)
+    return ViewValues(worth, np.where(candidates, (now + later) @ weigh, -np.inf), attention)
+
+
+@register_policy("view-attention")
+class ViewAttentionPolicy:
+    """Goes to the view that is worth most: what it gains at once, plus what the moves after it are expected to gain,
+    less the way there.
+
+    Args:
+        model: names the shipped weights.
+        weights: path of other weights, ``""`` for the shipped ones.
+        metres_weight: see :class:`Weighing`; by default what the weights were validated with, as the next two.
+        error_weight: likewise.
+        lookahead: likewise.
+        stop_below: stop when this and all later moves are expected to gain less than this many objects; 0 never does.
+
+    Raises:
+        ValueError: there are no usable weights, or a number is out of range.
+    """
+
+    def __init__(
+        self,
+        model: ObjectModel,
+        weights: str = "",
+        metres_weight: float | None = None,
+        error_weight: float | None = None,
+        lookahead: float | None = None,
+        stop_below: float = 0.0,
+    ) -> None:
+        path = Path(weights) if weights else shipped_weights("view-attention", model.name)
+        self.network = load_network(path, model.name)
+        given = {"metres_weight": metres_weight, "error_weight": error_weight, "lookahead": lookahead}
+        given = {name: value for name, value in given.items() if value is not None}
+        self._weighing = replace(self.network.weighing, **given)
+        self._stop_below = stop_below
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing is random here."""
+
+    def decide(self, observation: Observation) -> Decision:
+        """The view of most worth, and the object that it attends to."""
+        values = value_views(self.network, [observation], self._weighing)
+        most = values.gain[0].max()
+        if most == -np.inf or (self._stop_below > 0 and most < self._stop_below):
+            return Decision.stop_here(observation)
+        view = int(values.worth[0].argmax())
+        n = len(observation.objects)
+        if n == 0:
+            return Decision.go_to(observation, view)
+        attention = np.zeros(n)
+        attention[best_verified(observation)] = values.attention[0, view]
+        return Decision.go_to(observation, view, attention / attention.sum(), int(attention.argmax()))

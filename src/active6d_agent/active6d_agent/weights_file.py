@@ -1,0 +1,52 @@
+"""Trained policies on disk: tensors in safetensors, their configuration as JSON beside them. Nothing is executed."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
+
+_Module = TypeVar("_Module", bound=nn.Module)
+
+
+def shipped_weights(policy: str, object_name: str) -> Path:
+    """Where the shipped weights of a policy for an object are, or would be."""
+    return SHIPPED_WEIGHTS / f"{policy}_{object_name}.safetensors"
+
+
+def save_weights(module: nn.Module, path: Path, policy: str, config: dict, provenance: dict | None = None) -> None:
+    """Write ``path`` (.safetensors) and the configuration that :func:`load_weights` builds from beside it (.json)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_file({name: value.detach().cpu().clone() for name, value in module.state_dict().items()}, path)
+    document = {"policy": policy, **config, "provenance": provenance or {}}
+    path.with_suffix(".json").write_text(json.dumps(document, indent=2) + "\n")
+
+
+def load_weights(path: Path, policy: str, build: Callable[[dict], _Module]) -> _Module:
+    """Read what :func:`save_weights` wrote.
+
+    Args:
+        path: of the ``.safetensors``.
+        policy: whose weights they must be.
+        build: configuration to a module of that shape; may raise what it likes.
+
+    Raises:
+        ValueError: a file is missing, damaged or does not fit; one line that names the file and what to do.
+    """
+    train = f"active6d train policy --policy {policy}"
+    if not path.is_file():
+        raise ValueError(f"{path}: no weights of the {policy} policy here; train them with: {train}")
+    try:
+        config = json.loads(path.with_suffix(".json").read_text())
+        if config["policy"] != policy:
+            raise ValueError(f"these are weights of policy '{config['policy']}'")
+        module = build(config)
+        module.load_state_dict(load_file(path))
+    except Exception as error:  # safetensors and torch raise their own kinds
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: no weights of the {policy} policy ({reason}); train them with: {train}") from error
+    return module.eval()

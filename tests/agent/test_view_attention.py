@@ -1,0 +1,300 @@
+"""The policy that values every view: what must not matter does not, its labels are the truth, and it learns."""
+
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from synthetic_bank import synthetic_bank
+
+from active6d_agent import imitation
+from active6d_agent.baselines import line_of_sight
+from active6d_agent.evaluation import all_starts, observe, run_named, run_policy
+from active6d_agent.lookup import BankLookup
+from active6d_agent.oracle import search_views, tally, worth
+from active6d_agent.policy import create_policy
+from active6d_agent.view_attention import (
+    ViewAttentionPolicy,
+    Weighing,
+    encode,
+    new_network,
+    save_network,
+    value_views,
+)
+from active6d_core.se3 import make_transform
+
+
+@pytest.fixture(scope="module")
+def lookup():
+    return BankLookup(synthetic_bank("mug", scenes=2, objects=8))
+
+
+@pytest.fixture(scope="module")
+def network(lookup):
+    torch.manual_seed(0)
+    return new_network(lookup.model).eval()
+
+
+@pytest.fixture
+def observation(lookup):
+    return observe(lookup, np.array([0]), np.array([[3, 47, 80]]), np.array([3]))[0]
+
+
+@pytest.fixture
+def policy(lookup, network, tmp_path):
+    save_network(network, tmp_path / "weights.safetensors", "mug")
+
+    def make(**parameters):
+        return ViewAttentionPolicy(lookup.model, str(tmp_path / "weights.safetensors"), **parameters)
+
+    return make
+
+
+def values(network, observations):
+    with torch.inference_mode():
+        return [part.numpy() for part in network(encode(observations))]
+
+
+def test_the_order_of_objects_does_not_matter(network, observation):
+    order = np.random.default_rng(0).permutation(len(observation.objects))
+    shuffled = replace(observation, objects=observation.objects.take(order))
+    best = values(network, [observation])
+    again = values(network, [shuffled])
+    np.testing.assert_allclose(again[0], best[0], atol=1e-5)
+    np.testing.assert_allclose(again[1], best[1], atol=1e-5)
+
+
+def test_the_order_of_earlier_views_does_not_matter(network, observation):
+    other = replace(observation, positions=observation.positions[[1, 0, 2]])
+    np.testing.assert_allclose(values(network, [other])[0], values(network, [observation])[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["mug", "coffee_cup"])
+def test_turning_the_world_about_the_vertical_turns_the_values(name, observation):
+    """By three of the grid's azimuths: the value of a view moves on to the view three further."""
+    from active6d_core.object_model import load_object
+
+    torch.manual_seed(1)
+    network = new_network(load_object(name)).eval()
+    turn = Rotation.from_euler("z", 3 * 2 * np.pi / 20).as_matrix()
+    T = make_transform(turn, np.zeros(3)) @ observation.objects.T_world_object
+    turned = replace(
+        observation,
+        objects=replace(observation.objects, T_world_object=T),
+        positions=observation.positions @ turn.T,
+    )
+    before, after = values(network, [observation]), values(network, [turned])
+    for part in range(2):
+        rolled = np.roll(before[part][0].reshape(5, 20, -1), 3, axis=1).reshape(100, -1)
+        np.testing.assert_allclose(after[part][0], rolled, atol=1e-4)
+    assert np.ptp(before[0]) > 1e-3, "the values do differ"
+
+
+def test_turning_a_cup_about_its_axis_does_not_matter(observation):
+    from active6d_core.object_model import load_object
+
+    cup = load_object("coffee_cup")
+    torch.manual_seed(2)
+    network = new_network(cup).eval()
+    spin = make_transform(Rotation.from_rotvec(1.1 * cup.symmetry.axis).as_matrix(), np.zeros(3))
+    spun = replace(
+        observation, objects=replace(observation.objects, T_world_object=observation.objects.T_world_object @ spin)
+    )
+    np.testing.assert_allclose(values(network, [spun])[0], values(network, [observation])[0], atol=1e-4)
+
+
+def test_padding_does_not_matter(network, lookup, observation):
+    """Alone, and beside observations with more objects and more views."""
+    many = observe(lookup, np.array([1]), np.array([[5, 6, 7, 8, 20, 60, 70]]), np.array([1]))[0]
+    none = replace(observation, objects=observation.objects.take(np.zeros(0, int)))
+    for each in (observation, many, none):
+        alone = values(network, [each])
+        row = [id(x) for x in (many, none, observation)].index(id(each))
+        together = values(network, [many, none, observation])
+        for part in range(2):
+            np.testing.assert_allclose(together[part][row], alone[part][0], atol=1e-3)
+        n = len(each.objects)
+        np.testing.assert_allclose(together[2][row][:, :n].sum(axis=1), float(n > 0), atol=1e-5)
+        assert not together[2][row][:, n:].any()
+
+
+def test_nothing_is_left_to_gain_after_the_last_move(network, observation):
+    assert not values(network, [replace(observation, steps_left=1)])[1].any()
+    assert values(network, [observation])[1].any()
+
+
+def test_the_line_of_sight_is_the_heuristics(network, observation, lookup):
+    """Column 0 of the pairs, against the loop-free numpy of the baselines, object by object."""
+    _, pairs, _ = network.describe(encode([observation]))
+    centres = observation.objects.T_world_object[:, :3, 3]
+    for index in range(len(centres)):
+        expected = line_of_sight(centres, index, lookup.sphere.positions, lookup.model.diameter)
+        np.testing.assert_allclose(pairs[0, :, index, 0], expected, atol=1e-4)
+
+
+def test_candidates_are_kept_to(policy, observation):
+    made = policy()
+    assert made.decide(observation).view not in (3, 47, 80)
+    only = replace(observation, allowed=np.isin(np.arange(100), [3, 47, 80, 99]))
+    assert made.decide(only).view == 99
+    nothing = replace(observation, allowed=np.isin(np.arange(100), [3, 47, 80]))
+    assert made.decide(nothing).stop
+    assert made.decide(replace(observation, metres_left=0.01)).stop
+    blind = replace(observation, objects=observation.objects.take(np.zeros(0, int)))
+    decision = made.decide(blind)
+    assert decision.view is not None
+    assert decision.attended is None
+
+
+def test_many_objects_keep_the_best_verified(policy, observation):
+    many = observation.objects.take(np.tile(np.arange(len(observation.objects)), 40))
+    scores = np.linspace(0, 1, len(many))
+    decision = policy().decide(replace(observation, objects=replace(many, verification=scores)))
+    assert decision.attention.shape == (len(many),)
+    assert decision.attention.sum() == pytest.approx(1.0)
+    assert np.flatnonzero(decision.attention).min() >= len(many) - 64
+
+
+def test_metres_are_weighed_at_run_time(policy, observation):
+    sphere = observation.sphere
+    far, near = (policy(metres_weight=weight).decide(observation).view for weight in (0.0, 100.0))
+    arcs = sphere.arc(sphere.positions, observation.positions[-1])
+    assert arcs[near] == pytest.approx(arcs[observation.candidates()].min())
+    assert arcs[far] > arcs[near]
+
+
+def test_it_stops_when_nothing_is_to_be_gained(policy, network, observation):
+    gain = value_views(network, [observation], Weighing()).gain.max()
+    assert not policy(stop_below=0.0).decide(observation).stop
+    assert policy(stop_below=abs(gain) + 1.0).decide(observation).stop
+
+
+def test_what_counts_adds_up(network, observation):
+    weighing = Weighing(metres_weight=0.3, error_weight=0.7, lookahead=0.5)
+    now, later, _ = (part[0].astype(float) for part in values(network, [observation]))
+    found = value_views(network, [observation], weighing)
+    arcs = observation.sphere.arc(observation.sphere.positions, observation.positions[-1])
+    for view in np.flatnonzero(observation.candidates()):
+        expected = now[view] @ [1, 0.7] + 0.5 * later[view] @ [1, 0.7] - 0.3 * arcs[view]
+        assert found.worth[0, view] == pytest.approx(expected, abs=2e-5)
+
+
+def test_labels_are_what_views_gain(lookup):
+    """Against the environment's own results, view by view; the oracle takes the best of them."""
+    gains = imitation.candidate_gains(lookup, 1, np.array([8, 30]))
+    assert np.isnan(gains[[8, 30]]).all()
+    for view in (0, 31, 99):
+        views = np.array([[8, 30, view]])
+        added = tally(lookup, np.array([1]), views) - tally(lookup, np.array([1]), views[:, :2])
+        np.testing.assert_allclose(gains[view], added[0])
+    worths = [worth(lookup, np.array([1]), np.array([[8, view]]))[0] if view != 8 else -1 for view in range(100)]
+    first = imitation.candidate_gains(lookup, 1, np.array([8])) @ [1.0, 0.999 / 8]
+    assert int(np.argmax(worths)) == int(np.nanargmax(np.round(first, 9))) == search_views(lookup, 1, 8, 1)[1]
+
+
+def test_later_gains_are_the_learners_own_moves(lookup):
+    """Played out in the training, and by the deployed policy from the same state."""
+    parameters = imitation.ImitationParameters(
+        rounds=1, episodes=6, improve_after=0.0, longest=3, updates=1, explore=0.0, rollouts=4
+    )
+    learner = imitation._Learner(lookup, parameters, Weighing())
+    learner._collect()
+    checked = 0
+    for example in learner.memory:
+        left = example.observation.steps_left
+        played = np.flatnonzero(np.isfinite(example.later[:, 0]))
+        assert (len(played) > 0) == (left > 1)
+        taken = [int(lookup.sphere.nearest(position)) for position in example.observation.positions]
+        scene = next(s for s in (0, 1) if np.array_equal(lookup.objects(s, taken).box, example.observation.objects.box))
+        for view in played[:1]:
+            path = [*taken, int(view)]
+            for remaining in range(left - 1, 0, -1):
+                seen = observe(lookup, np.array([scene]), np.array([path]), np.array([remaining]))
+                path.append(int(imitation.greedy(learner.network)(seen)[0]))
+            scenes = np.array([scene])
+            gained = tally(lookup, scenes, np.array([path])) - tally(lookup, scenes, np.array([[*taken, view]]))
+            np.testing.assert_allclose(example.later[view], gained[0])
+            checked += 1
+    assert checked
+
+
+def test_training_and_deployment_move_alike(lookup, network, policy):
+    starts = all_starts(lookup, 10, 0)
+    deployed = run_policy(lookup, lambda scene: policy(), starts, 4)
+    measured = imitation.validate(network, lookup, starts, 4)
+    assert measured[0] == pytest.approx(deployed.detection_rate.mean())
+    assert measured[2] == pytest.approx(deployed.distance_m.mean())
+
+
+def test_it_learns_its_way_past_random_and_resumes(tmp_path):
+    lookup = BankLookup(synthetic_bank("mug", scenes=3, objects=12))
+    starts = all_starts(lookup, 100, 0)
+    random = run_named(lookup, "random", starts, 4)
+    settings = {"episodes": 10, "updates": 20, "longest": 4, "steps": 4, "starts": 100, "batch": 48, "rollouts": 4}
+    parameters = imitation.ImitationParameters(rounds=4, evaluate_every=2, improve_after=0.8, **settings)
+    curve = list(imitation.imitate(lookup, lookup, tmp_path, parameters, Weighing(metres_weight=0.05)))
+    assert [progress.round for progress in curve] == [2, 4]
+    best = max(progress.detection_rate for progress in curve)
+    assert best > random.detection_rate.mean() + 0.03
+    weights = {"weights": str(tmp_path / "best.safetensors")}
+    deployed = run_named(lookup, "view-attention", starts, 4, parameters=weights)
+    assert deployed.detection_rate.mean() == pytest.approx(best)
+    assert deployed.e_add_mm.mean() < random.e_add_mm.mean()
+    more = imitation.ImitationParameters(rounds=5, evaluate_every=2, **settings)
+    assert [p.round for p in imitation.imitate(lookup, lookup, tmp_path, more, resume=True)] == [5]
+    assert len((tmp_path / "curve.jsonl").read_text().splitlines()) == 3
+    with pytest.raises(ValueError, match="no weights of the view-attention policy"):
+        next(imitation.imitate(lookup, lookup, tmp_path / "none", more, resume=True))
+
+
+def test_a_decision_is_fast(policy, lookup):
+    """The best of several, since other load on the machine only adds to it."""
+    made = policy()
+    seen = observe(lookup, np.array([0]), np.array([[1, 20, 40, 60, 80, 99]]), np.array([1]))[0]
+    times = []
+    for _ in range(10):
+        began = time.perf_counter()
+        made.decide(seen)
+        times.append(time.perf_counter() - began)
+    assert min(times) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("weights.safetensors", lambda path: path.write_bytes(b"no tensors"), "no weights of the view-attention"),
+        ("weights.safetensors", lambda path: path.unlink(), "active6d train policy --policy view-attention"),
+        ("weights.json", lambda path: path.unlink(), "no weights of the view-attention policy"),
+        ("weights.json", lambda path: path.write_text('{"policy": "attention"}'), "weights of policy 'attention'"),
+        (
+            "weights.json",
+            lambda path: path.write_text(json.dumps({**json.loads(path.read_text()), "hidden": 9})),
+            "state_dict",
+        ),
+        (
+            "weights.json",
+            lambda path: path.write_text(json.dumps({**json.loads(path.read_text()), "object": "bunny"})),
+            "weights for 'bunny', not for 'mug'",
+        ),
+    ],
+)
+def test_damaged_weights_are_refused_in_one_line(network, lookup, tmp_path, name, damage, message):
+    save_network(network, tmp_path / "weights.safetensors", "mug")
+    damage(tmp_path / name)
+    with pytest.raises(ValueError, match=message) as error:
+        create_policy("view-attention", lookup.model, weights=str(tmp_path / "weights.safetensors"))
+    assert "\n" not in str(error.value)
+    assert "weights.safetensors" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"), [({"metres_weight": -1.0}, "metres_weight"), ({"lookahead": 2.0}, "lookahead")]
+)
+def test_parameters_out_of_range_are_named(policy, parameters, message):
+    with pytest.raises(ValueError, match=message):
+        policy(**parameters)
+    with pytest.raises(ValueError, match="rounds"):
+        imitation.ImitationParameters(rounds=0)
