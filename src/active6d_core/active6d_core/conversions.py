@@ -160,7 +160,7 @@ def depth_to_image(depth: np.ndarray, stamp: int, frame: str) -> Image:
 
 
 def image_to_depth(message: Image) -> np.ndarray:
-    """A ``32FC1`` (metres) or ``16UC1`` (millimetres) Image to (H, W) float32 metres, NaN where not positive and finite.
+    """A ``32FC1`` (metres) or ``16UC1`` (millimetres) Image to (H, W) float32 metres, NaN unless positive and finite.
 
     Raises:
         MessageError: another encoding, or sizes that disagree.

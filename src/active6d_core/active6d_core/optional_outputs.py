@@ -1,4 +1,4 @@
-"""Results as ``Detection3DArray`` and ``/tf``, where vision_msgs and tf2_msgs are installed (any apt installation of ROS 2).
+"""Results as ``Detection3DArray`` and ``/tf``, where vision_msgs and tf2_msgs are installed (as with apt's ROS 2).
 
 Without them nothing else is missing: the graph itself needs neither.
 """
