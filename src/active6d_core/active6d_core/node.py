@@ -114,7 +114,7 @@ class GraphNode(LifecycleNode):
     def camera_input(
         self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool
     ) -> Subscription:
-        """An :meth:`input` from a camera: latched as this project's are, else best effort, which every driver matches."""
+        """An :meth:`input` from a camera: latched as this project's are, else best effort, which suits all drivers."""
         qos = _qos(latched, depth=_QUEUE_DEPTH)
         if not latched:
             qos.reliability = ReliabilityPolicy.BEST_EFFORT
