@@ -1,20 +1,22 @@
 """Messages to the core's types and back: what goes round comes back equal, and what is wrong is refused."""
 
 import array
+import contextlib
 
 import numpy as np
 import pytest
-from active6d_core import conversions
-from active6d_core.camera import PinholeCamera
-from active6d_core.conversions import MessageError
-from active6d_core.hypotheses import Hypotheses, SceneObjects
-from active6d_core.se3 import make_transform
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image, PointCloud2
+
+from active6d_core import conversions
+from active6d_core.camera import PinholeCamera
+from active6d_core.conversions import MessageError
+from active6d_core.hypotheses import Hypotheses, SceneObjects
+from active6d_core.se3 import make_transform
 
 FRAME = "camera_optical_frame"
 seeds = st.integers(0, 2**32 - 1)
@@ -62,11 +64,11 @@ def test_a_quaternion_means_what_scipy_says_it_means():
     np.testing.assert_allclose(conversions.pose_to_transform(pose)[:3, 0], [0, 1, 0], atol=1e-12)
 
 
-@pytest.mark.parametrize("field, value", [("w", 0.0), ("w", 2.0), ("x", float("nan"))])
+@pytest.mark.parametrize(("field", "value"), [("w", 0.0), ("w", 2.0), ("x", float("nan"))])
 def test_bad_quaternions_are_refused(field, value):
     pose = conversions.transform_to_pose(np.eye(4))
     setattr(pose.orientation, field, value)
-    with pytest.raises(MessageError, match="quaternion|finite"):
+    with pytest.raises(MessageError, match=r"quaternion|finite"):
         conversions.pose_to_transform(pose)
 
 
@@ -83,7 +85,7 @@ def test_color_images_come_back(color):
     np.testing.assert_array_equal(conversions.image_to_color(image), color)
 
 
-@pytest.mark.parametrize("encoding, order", [("bgr8", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])])
+@pytest.mark.parametrize(("encoding", "order"), [("bgr8", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])])
 def test_other_channel_orders_are_understood(encoding, order):
     color = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
     stored = np.ascontiguousarray(color[..., order])
@@ -221,10 +223,8 @@ def test_arbitrary_tables_are_read_or_refused(data, height, width, point_step, r
     cloud = conversions.hypotheses_to_cloud(random_hypotheses(3), 1, FRAME)
     cloud.height, cloud.width, cloud.point_step, cloud.row_step = height, width, point_step, row_step
     cloud.data = array.array("B", data)
-    try:
+    with contextlib.suppress(MessageError):
         conversions.hypotheses_from_cloud(cloud, np.zeros((4, 4), np.uint16), FRAME)
-    except MessageError:
-        pass
 
 
 @given(seeds)
@@ -255,7 +255,13 @@ def test_attention_comes_back(attended):
 
 def test_markers_colour_by_verification_and_clear_the_last_ones():
     objects = SceneObjects(
-        np.eye(4)[None].repeat(2, 0), np.array([0.0, 1.0]), np.zeros(2), np.zeros((2, 4)), np.ones(2), np.ones(2, int), np.zeros(2)
+        T_world_object=np.eye(4)[None].repeat(2, 0),
+        verification=np.array([0.0, 1.0]),
+        score=np.zeros(2),
+        box=np.zeros((2, 4)),
+        depth=np.ones(2),
+        support=np.ones(2, int),
+        spread=np.zeros(2),
     )
     clear, low, high = conversions.objects_to_markers(objects, "file:///mug.ply", 1, "world").markers
     assert clear.action == clear.DELETEALL

@@ -98,7 +98,7 @@ def test_inputs_are_ignored_until_the_node_is_active(graph):
 def test_a_failing_setup_is_reported_with_its_reason(graph):
     node = graph.add(DepthNode(context=graph.context), start=False)
     node.fail_at_setup = True
-    with pytest.raises(ValueError, match="missing.ply"):
+    with pytest.raises(ValueError, match=r"missing\.ply"):
         node.start()
 
 
