@@ -19,7 +19,7 @@ from active6d_perception.dense.network_input import output_camera, ray_frames, r
 from active6d_perception.dense.sphere_bins import CENTRES
 from active6d_perception.dense.weights_file import TrainedNetwork, load_network, save_network
 from active6d_perception.estimator import create_estimator, list_estimators
-from active6d_perception.training.augmentation import augment
+from active6d_perception.training.augmentation import augment, crop
 from active6d_perception.training.batches import TrainingViews, batches, input_tensor
 from active6d_perception.training.loop import TrainingOptions, train
 from active6d_perception.training.losses import LossWeights, loss_terms, total
@@ -63,7 +63,7 @@ def right_answer(sample, targets):
     for name in ("centre", "coordinates", "axis"):
         parts[name].reshape(3, -1)[:, targets.pixel] = getattr(targets, name).T
     axis = targets.axis.T
-    parts["axis_line"].reshape(6, -1)[:, targets.pixel] = [*axis**2, axis[0] * axis[1], axis[1] * axis[2], axis[2] * axis[0]]
+    parts["axis_line"].reshape(6, -1)[:, targets.pixel] = [*axis**2, *(axis * np.roll(axis, -1, axis=0))]
     parts["direction"].reshape(len(CENTRES), -1)[:, targets.pixel] = np.log(targets.direction.T + 1e-6)
     return answer
 
@@ -177,6 +177,22 @@ def test_augmentation_keeps_the_truth_and_never_mirrors(mug_view):
         assert np.abs(changed.depth - view.depth)[both].max() < 0.008
         gray, before = changed.color.mean(axis=-1).ravel(), view.color.mean(axis=-1).ravel()
         assert np.corrcoef(gray, before)[0, 1] > 0.9
+
+
+def test_a_crop_has_the_targets_of_the_whole(mug_view):
+    sample, _, _ = mug_view
+    model = load_object("mug")
+    cropped = crop(sample, 96, 128, np.random.default_rng(3))
+    assert cropped.view.depth.shape == (96, 128)
+    assert cropped.instance.shape == (48, 64)
+    camera, whole = cropped.view.camera, sample.view.camera
+    top, left = round(whole.cy - camera.cy), round(whole.cx - camera.cx)
+    assert (cropped.view.color == sample.view.color[top : top + 96, left : left + 128]).all()
+    part, full = (make_targets(item, gauge_of(model), model.diameter) for item in (cropped, sample))
+    row, column = np.divmod(part.pixel, 64)
+    place = np.searchsorted(full.pixel, (row + top // 2) * 160 + column + left // 2)
+    for name in ("centre", "coordinates", "axis", "direction"):
+        assert np.allclose(getattr(part, name), getattr(full, name)[place], atol=1e-5)
 
 
 def test_heaps_to_learn_from_share_no_seed_with_stored_scenes():

@@ -60,7 +60,7 @@ def graph(
 def estimator(
     object_name: ObjectName = "mug",
     names: Annotated[
-        list[str] | None, typer.Option("--estimator", help="Estimator; repeatable. All that know the object by default.")
+        list[str] | None, typer.Option("--estimator", help="Estimator; repeatable. All that know it by default.")
     ] = None,
     split: Annotated[str, typer.Option(help="Which stored scenes.")] = "test",
     sample: Annotated[int | None, typer.Option(min=1, help="That many views, drawn by --seed; all by default.")] = None,

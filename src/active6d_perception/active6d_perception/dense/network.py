@@ -19,7 +19,7 @@ HEADS = {
     "coordinates": 3,  # the surface point in the canonical frame, diameters
     "coordinates_scale": 1,  # logarithm of the Laplace scale of its error
     "axis": 3,  # the axis frame's z in the frame of the ray through its origin; not normalised
-    "axis_line": 6,  # the axis without its sign: xx, yy, zz, xy, yz, zx of its outer product; learned first, helps the rest
+    "axis_line": 6,  # xx, yy, zz, xy, yz, zx of the axis: it without its sign, which is learned sooner
     "direction": DIRECTION_BINS,  # logits: the axis frame's x in that same frame
 }
 

@@ -114,7 +114,7 @@ def network_input(view: ReducedView, diameter: float) -> np.ndarray:
 
 
 def _normal_moments(normals: np.ndarray) -> np.ndarray:
-    """(6, h, w) means of nx nx, ny ny, nz nz, nx ny, ny nz, nz nx around each pixel, of (3, h, w) normals, 0 if invalid."""
+    """(6, h, w) means of xx, yy, zz, xy, yz, zx around each pixel, of (3, h, w) normals that are 0 where invalid."""
     products = np.concatenate([normals * normals, normals * np.roll(normals, -1, axis=0)])
     moments = uniform_filter(products, (0, _MOMENT_WINDOW, _MOMENT_WINDOW), mode="nearest")
     return moments / np.maximum(moments[:3].sum(axis=0), 1e-2)

@@ -10,12 +10,14 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from active6d_perception.dense.gauge import Gauge
 from active6d_perception.dense.network_input import network_input, pad
-from active6d_perception.training.augmentation import augment
+from active6d_perception.training.augmentation import augment, crop
 from active6d_perception.training.samples import Sample, read_shard
 from active6d_perception.training.targets import Targets, make_targets
 
 #: Files read together; their views are mixed before they are used.
 _SHARDS_TOGETHER = 24
+#: Height and width of the part of a view that is learned from at a time; objects seldom cover more.
+_WINDOW = (160, 208)
 
 
 class TrainingViews(IterableDataset):
@@ -48,6 +50,7 @@ class TrainingViews(IterableDataset):
                     yield self._prepare(samples[index], rng)
 
     def _prepare(self, sample: Sample, rng: np.random.Generator) -> tuple[Tensor, Targets]:
+        sample = crop(sample, *_WINDOW, rng)
         view = augment(sample.view, rng)
         return input_tensor(view, self._diameter), make_targets(sample, self._gauge, self._diameter)
 

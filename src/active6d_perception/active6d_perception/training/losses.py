@@ -22,18 +22,18 @@ class LossWeights:
     centre: float = 2.0
     coordinates: float = 2.0
     scale: float = 0.1
-    axis: float = 1.0
-    axis_line: float = 1.0
+    axis: float = 2.0
+    axis_line: float = 2.0
     direction: float = 0.3
 
 
 def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
     """The terms of the loss, by the names of :class:`LossWeights`.
 
-    ``centre``, ``coordinates`` and ``axis`` are mean distances ``e``, the first two in diameters. ``scale`` is the negative
-    log-likelihood ``e / b + 3 log b`` of an isotropic Laplace distribution in space whose scale b the network tells, so
-    it learns to say where it is unsure. The errors in it are held fixed: a likelihood that trained the points as well
-    would weigh each head by 1 / b, and what is learned first (the centre) would drown what is hard (the axis).
+    ``centre``, ``coordinates`` and ``axis`` are mean distances ``e``, the first two in diameters. ``scale`` is the
+    negative log-likelihood ``e / b + 3 log b`` of an isotropic Laplace distribution in space whose scale b the network
+    tells, so it learns to say where it is unsure. The errors in it are held fixed: a likelihood that trained the points
+    as well would weigh each head by 1 / b, and what is learned first (the centre) would drown what is hard (the axis).
 
     Args:
         answer: (n, channels, h, w), at least as large as the targets.

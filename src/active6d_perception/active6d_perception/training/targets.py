@@ -20,7 +20,8 @@ class Targets:
     Attributes:
         mask: (h, w) float32, 1 on objects.
         pixel: (p,) flat indices into (h, w).
-        weight: (p,) float32; instances count by the square root of their pixels, so that small ones count; mean 1.
+        weight: (p,) float32, mean 1. Instances count by the square root of their pixels, so that distant ones count,
+            and by their visible fraction, since nobody can tell the orientation of a sliver.
         centre: (p, 3) float32, as the network's head of that name; likewise ``coordinates`` and ``axis``.
         coordinates: (p, 3) float32.
         axis: (p, 3) float32.
@@ -57,7 +58,7 @@ def make_targets(sample: Sample, gauge: Gauge, diameter: float) -> Targets:
     if gauge.turn is not Turn.INVISIBLE:
         direction = kernel(np.einsum("nij,nj->ni", R_ray_camera, T_axis[:, :3, 0]))
     count = np.bincount(instance, minlength=len(T_axis))
-    weight = 1 / np.sqrt(count[instance])
+    weight = (sample.visible_fraction / np.sqrt(np.maximum(count, 1)))[instance]
     return Targets(
         mask=(sample.instance >= 0).astype(np.float32),
         pixel=pixel,
