@@ -95,13 +95,18 @@ class PreparedCamera(GraphNode):
         self._pose.publish(transform_to_pose_stamped(view.T_world_camera, view.stamp, self.world_frame))
 
 
-def prepare_views(object_name: str, seed: int, count: int, hypotheses: int) -> PreparedViews:
-    """Render ``count`` random views of a heap, with ``hypotheses`` of them per view around the true poses."""
+def prepare_views(
+    object_name: str, seed: int, count: int, hypotheses: int, *, objects: int | None = None
+) -> PreparedViews:
+    """Render ``count`` random views of a heap, with ``hypotheses`` of them per view around the true poses.
+
+    The heap has ``objects`` instances, by default nearly as many as the object's heaps may have.
+    """
     from active6d_sim.heap import drop_heap
     from active6d_sim.renderer import SceneRenderer
 
     model, sphere, rng = load_object(object_name), ViewSphere(), np.random.default_rng(seed)
-    scene = drop_heap(model, seed, count=model.instances[1] - 2)
+    scene = drop_heap(model, seed, count=objects or model.instances[1] - 2)
     renderer = SceneRenderer(scene)
     views, found = [], {}
     for index, position in enumerate(rng.permutation(len(sphere))[:count]):

@@ -8,7 +8,20 @@ import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from active6d_bringup.cli import bank, benchmark, doctor, episode, evaluate, objects, replay, report, scenes, train
+from active6d_bringup.cli import (
+    agent_benchmark,
+    bank,
+    benchmark,
+    doctor,
+    episode,
+    evaluate,
+    objects,
+    policy_training,
+    replay,
+    report,
+    scenes,
+    train,
+)
 
 
 class CommandGroup(TyperGroup):
@@ -66,7 +79,10 @@ app.command()(bank.bank)
 app.command()(evaluate.evaluate)
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
+benchmark.app.command()(agent_benchmark.environment)
+benchmark.app.command()(agent_benchmark.pipeline)
 app.add_typer(benchmark.app, name="benchmark")
+train.app.command()(policy_training.policy)
 app.add_typer(train.app, name="train")
 
 
