@@ -9,12 +9,14 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.conversions import (
+    MessageError,
     camera_to_info,
     color_to_image,
     depth_to_image,
     make_header,
     pose_stamped_to_transform,
     poses_to_array,
+    stamp_to_ns,
     transform_to_pose_stamped,
 )
 from active6d_core.hypotheses import Hypotheses
@@ -55,13 +57,18 @@ class StubCameraNode(GraphNode):
         self._publish()
 
     def _on_goal(self, message: PoseStamped) -> None:
+        if stamp_to_ns(message.header.stamp) < self._stamp():
+            raise MessageError("stale goal")  # of a view that was estimated again
         self._count += 1
         if self._count != self._deaf_from:
             self._pose = pose_stamped_to_transform(message, self.world_frame)
             self._publish()
 
+    def _stamp(self) -> int:
+        return 10**9 + self._count * 500_000_000
+
     def _publish(self) -> None:
-        stamp = 10**9 + self._count * 500_000_000
+        stamp = self._stamp()
         with self.measure(stamp):
             rng = np.random.default_rng([self._seed, stamp])
             depth = rng.uniform(0.6, 0.9, (CAMERA.height, CAMERA.width)).astype(np.float32)

@@ -74,16 +74,14 @@ def record(bags):
 
 
 def messages(folder):
-    """Topic to (stamp or None, canonical payload), in order."""
+    """Topic to (stamp, payload), in order."""
     found = {}
     with Reader(folder) as reader:
         for connection, _, payload in reader.messages():
             message = TYPESTORE.deserialize_cdr(payload, connection.msgtype)
             header = getattr(message, "header", None) or message.markers[0].header
-            # CDR's padding has no meaning, and the middleware leaves it undefined.
-            canonical = bytes(TYPESTORE.serialize_cdr(message, connection.msgtype))
             stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
-            found.setdefault(connection.topic.removeprefix("/"), []).append((stamp, canonical))
+            found.setdefault(connection.topic.removeprefix("/"), []).append((stamp, bytes(payload)))
     return found
 
 

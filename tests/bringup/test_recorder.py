@@ -9,16 +9,17 @@ from collections import defaultdict
 
 import pytest
 import yaml
+from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
 from stub_episode import StubEpisode, is_latched
 
 from active6d_bringup.nodes.episode_recorder import EpisodeRecorderNode
-from active6d_bringup.recording import CONTRACT, TYPESTORE, RecordingError, stamp_of
+from active6d_bringup.recording import CONTRACT, RecordingError, clear_padding, stamp_of
 from active6d_core.node import GraphNode
 
 TYPES = {topic.name: topic.type for topic in CONTRACT}
@@ -42,17 +43,29 @@ def assert_holds(folder, sent):
     expected = defaultdict(list)
     for topic, message in sent:
         name = topic if topic.startswith("/") else f"/{topic}"
-        expected[name].append(canonical(serialize_message(message), TYPES[topic]))
+        expected[name].append(clear_padding(TYPES[topic], serialize_message(message)))
     found = defaultdict(list)
     with Reader(folder) as reader:
         for connection, _, payload in reader.messages():
-            found[connection.topic].append(canonical(payload, connection.msgtype))
+            found[connection.topic].append(bytes(payload))
     assert found == expected
 
 
-def canonical(payload, message_type):
-    """The payload with zeros in CDR's padding, which the middleware leaves undefined."""
-    return bytes(TYPESTORE.serialize_cdr(TYPESTORE.deserialize_cdr(payload, message_type), message_type))
+def test_padding_is_cleared_and_nothing_else():
+    for topic, message in StubEpisode().messages():
+        payload = serialize_message(message)
+        cleared = clear_padding(TYPES[topic], payload)
+        assert deserialize_message(cleared, type(message)) == deserialize_message(payload, type(message))
+        assert len(cleared) == len(payload)
+    message = PoseStamped()
+    message.header.frame_id = "ab"
+    payload = bytearray(serialize_message(message))
+    payload[19:20] = (
+        b"\x7f"  # after 4 bytes of encapsulation, 8 of stamp, 4 of length and "ab\0": the gap before a double
+    )
+    assert clear_padding(TYPES["camera/pose"], bytes(payload))[19] == 0
+    garbled = serialize_message(message).replace(b"ab", b"\xff\xfe")
+    assert clear_padding(TYPES["camera/pose"], garbled) == garbled
 
 
 @pytest.mark.parametrize("late", [False, True])

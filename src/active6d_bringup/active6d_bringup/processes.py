@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 
 from lifecycle_msgs.msg import Transition
@@ -17,6 +18,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from active6d_bringup.composition import NODES, GraphDescription, OnEvent, open_context
+from active6d_core.node import connections
 
 #: Nodes that an episode survives: they find their inputs again as latched messages.
 RESTARTED = ("hypothesis_fusion", "pose_estimator")
@@ -77,8 +79,7 @@ class ProcessGraph:
         }
         for name, client in clients.items():
             self._wait(client.service_is_ready, f"{name} did not come up")
-        if "episode_recorder" in clients:
-            self._wait(self._recorder_connected, "episode_recorder did not find every topic of the graph")
+        self._wait(self._all_connected, "the nodes did not find each other")
         self._change(clients, Transition.TRANSITION_CONFIGURE)
         for name, client in clients.items():
             self._change({name: client}, Transition.TRANSITION_ACTIVATE)
@@ -149,15 +150,21 @@ class ProcessGraph:
                 raise ProcessError(f"{failure} within {self._patience:.0f} s")
             self.spin_once(0.05)
 
-    def _recorder_connected(self) -> bool:
-        client = self._node.create_client(Trigger, "episode_recorder/connected")
-        try:
-            self._wait(client.service_is_ready, "episode_recorder did not come up")
+    def _all_connected(self) -> bool:
+        """Whether every node has found everybody that it speaks to and listens to, this process's own among them."""
+        reports = [connections(node) for node in self._guests]
+        for name in self._description.in_order():
+            client = self._node.create_client(Trigger, f"{name}/connections")
+            self._wait(client.service_is_ready, f"{name} did not come up")
             answer = client.call_async(Trigger.Request())
-            self._wait(answer.done, "episode_recorder did not answer")
-            return answer.result().success
-        finally:
+            self._wait(answer.done, f"{name} did not answer")
+            reports.append(json.loads(answer.result().message))
             self._node.destroy_client(client)
+        for own, others in (("outputs", "inputs"), ("inputs", "outputs")):
+            expected = Counter(topic for report in reports for topic, _ in report[others])
+            if any(found < expected[topic] for report in reports for topic, found in report[own]):
+                return False
+        return True
 
     def _change(self, clients: dict[str, Client], transition: int) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
 #: Definitions and hashes of every standard message type.
@@ -44,7 +45,7 @@ class RecordedTopic:
     type: str
     per: Per
     latched: bool = False
-    depth: int = 1
+    depth: int = 10
 
 
 CAMERA_TOPICS = (
@@ -112,8 +113,9 @@ class EpisodeWriter:
 
     def write(self, topic: str, payload: bytes, received: int) -> None:
         """Append one message of the contract's ``topic``: its CDR bytes, and when it came in nanoseconds."""
-        self._writer.write(self._connections[topic], received, payload)
-        self._stamps[topic].add(stamp_of(self._topics[topic].type, payload))
+        message_type = self._topics[topic].type
+        self._writer.write(self._connections[topic], received, clear_padding(message_type, payload))
+        self._stamps[topic].add(stamp_of(message_type, payload))
 
     @property
     def message_count(self) -> int:
@@ -131,7 +133,8 @@ class EpisodeWriter:
         A topic per view must have spoken at ``stamp``; one per move, at every view of the same episode before it.
         """
         start = max((begun for begun in self._stamps[START] if begun <= stamp), default=0)
-        before = {view for view in self._stamps[POSE] if start <= view < stamp}
+        views = set().union(*(self._stamps[topic.name] for topic in CONTRACT if topic.per is Per.VIEW))
+        before = {view for view in views if start <= view < stamp}
         required = {
             Per.VIEW: before | {stamp},
             Per.MOVE: before,
@@ -146,6 +149,18 @@ class EpisodeWriter:
         if not self._closed:
             self._closed = True
             self._writer.close()
+
+
+def clear_padding(message_type: str, payload: bytes) -> bytes:
+    """The same serialized message with zeros for padding, so that the same seed gives the same bytes.
+
+    CDR aligns its fields, and the middleware leaves in the gaps whatever its buffer held. A payload that does not
+    decode (text that is not UTF-8) is returned as it is: a recorder keeps what it hears.
+    """
+    try:
+        return bytes(TYPESTORE.serialize_cdr(TYPESTORE.deserialize_cdr(payload, message_type), message_type))
+    except (SerdeError, ValueError):
+        return payload
 
 
 def stamp_of(message_type: str, payload: bytes) -> int:

@@ -1,5 +1,6 @@
 """What every node shares: lifecycle, checked parameters, guarded inputs, diagnostics, matching of stamps."""
 
+import json
 import signal
 import sys
 import time
@@ -14,14 +15,17 @@ from rclpy.context import Context
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
 from active6d_core.conversions import MessageError, ns_to_stamp
 
+# Both ends: a reliable writer forgets what its queue cannot hold, received by everybody or not.
 _QUEUE_DEPTH = 10
 _LOG_PERIOD_SECONDS = 5.0
 
@@ -52,6 +56,7 @@ class GraphNode(LifecycleNode):
         self._rejected = 0
         self._last_view_at: float | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 100)
+        self.create_service(Trigger, "~/connections", self._answer_connections)
         self.autostart = self.declare("autostart", True, "configure and activate the node by itself when it starts")
         self.world_frame = self.declare("world_frame", "world", "frame of the bin: origin at its centre, z up")
         self.camera_frame = self.declare(
@@ -100,9 +105,9 @@ class GraphNode(LifecycleNode):
         return value
 
     def output(self, message_type: type, topic: str, latched: bool = False) -> Publisher:
-        """A reliable publisher; ``latched`` keeps its last message for those who come later (transient-local)."""
+        """A reliable publisher; ``latched`` keeps its last messages for those who come later (transient-local)."""
         return self.create_lifecycle_publisher(
-            message_type, topic, _qos(latched, depth=1), qos_overriding_options=_overridable()
+            message_type, topic, _qos(latched, depth=_QUEUE_DEPTH), qos_overriding_options=_overridable()
         )
 
     def input(
@@ -164,6 +169,11 @@ class GraphNode(LifecycleNode):
         report.header.stamp = ns_to_stamp(stamp)
         self._diagnostics.publish(report)
 
+    def _answer_connections(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        response.message = json.dumps(connections(self))
+        return response
+
     # Lifecycle
 
     def start(self) -> None:
@@ -212,6 +222,18 @@ class GraphNode(LifecycleNode):
             self.get_logger().error(f"{step.__name__} failed: {error}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
+
+
+def connections(node: Node) -> dict[str, list[tuple[str, int]]]:
+    """The topics of a node's ``outputs`` and ``inputs``, each with how many counterparts it has found.
+
+    Whoever starts a graph asks for this before letting anybody speak: the middleware takes seconds to introduce
+    processes to each other, and a message to a stranger is lost.
+    """
+    return {
+        "outputs": [(output.topic_name, output.get_subscription_count()) for output in node.publishers],
+        "inputs": [(input.topic_name, input.get_publisher_count()) for input in node.subscriptions],
+    }
 
 
 class StampSynchronizer:

@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from active6d_bringup.recording import CONTRACT, END, EpisodeWriter, Per, RecordedTopic, describe_missing
+from active6d_bringup.recording import CONTRACT, END, EpisodeWriter, RecordedTopic, describe_missing
 from active6d_core.node import GraphNode, run_node
 
 
@@ -29,7 +29,6 @@ class EpisodeRecorderNode(GraphNode):
         self._settings = self.declare("settings", "{}", "what the other nodes were told, JSON, kept in metadata.yaml")
         self._writer: EpisodeWriter | None = None
         self._subscriptions_by_topic = {topic.name: self._subscribe(topic) for topic in CONTRACT}
-        self.create_service(Trigger, "~/connected", self._answer_connected)
         self.create_service(Trigger, "~/complete", self._answer_complete)
 
     def setup(self) -> None:
@@ -84,14 +83,6 @@ class EpisodeRecorderNode(GraphNode):
     def _write(self, topic: str, payload: bytes) -> None:
         if self._writer is not None:
             self._writer.write(topic, payload, self.get_clock().now().nanoseconds)
-
-    def _answer_connected(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Whether every topic that the graph cannot do without has a publisher that this node has found."""
-        needed = [topic.name for topic in CONTRACT if topic.per is not Per.WHENEVER]
-        alone = [topic for topic in needed if not self._subscriptions_by_topic[topic].get_publisher_count()]
-        response.success = not alone
-        response.message = f"no publisher of {', '.join(alone)}" if alone else "connected"
-        return response
 
     def _answer_complete(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Whether the last episode that has ended is on record in full."""
