@@ -93,6 +93,20 @@ def test_order_of_objects_does_not_matter():
     assert order[shuffled[2]] == index
 
 
+def test_the_ablation_attends_to_the_lowest_score():
+    torch.manual_seed(5)
+    module, objects = ObjectAttention("lowest-score"), torch.rand(4, 9, 6)
+    mask = (torch.arange(9) < 6).float().expand(4, 9)
+    attended, weight, index = module(objects, mask)
+    torch.testing.assert_close(index, objects[:, :6, 5].argmin(dim=1))
+    torch.testing.assert_close(weight.argmax(dim=1), index)
+    torch.testing.assert_close(weight.sum(dim=1), torch.ones(4))
+    torch.testing.assert_close(attended[:, 6:], objects[torch.arange(4), index])
+    torch.testing.assert_close(attended[:, :6], module.fc(objects)[torch.arange(4), index])
+    with pytest.raises(ValueError, match="no rule 'psychic'"):
+        ObjectAttention("psychic")
+
+
 def test_without_objects_nothing_is_attended():
     attended, weight, index = ObjectAttention()(torch.rand(1, 5, 6), torch.zeros(1, 5))
     assert not attended.any()
@@ -112,6 +126,33 @@ def test_gradients_flow_from_the_policy_through_the_weight(network):
     for name, parameter in network.attention.named_parameters():
         if name != "selector.bias":  # one constant added to all scores leaves their softmax as it is
             assert parameter.grad.abs().sum() > 0, name
+
+
+def test_ppos_objective_teaches_the_attention(lookup):
+    """Its gradient by the Selector is that of finite differences: it flows through the weight in o_t alone."""
+    environment = BankVecEnv(Active6DVectorEnv(lookup, 6))
+    environment.seed(1)
+    torch.manual_seed(6)
+    policy = PaperPolicy(environment.observation_space, environment.action_space, lambda _: 1e-4).double()
+    observation = {name: torch.from_numpy(values).double() for name, values in environment.reset().items()}
+    actions = policy.forward(observation)[0].detach()
+    advantage = torch.randn(6, dtype=torch.float64)
+
+    def objective():
+        return (policy.evaluate_actions(observation, actions)[1] * advantage).sum()
+
+    selector = policy.features_extractor.attention.selector.weight
+    objective().backward()
+    gradient, step = selector.grad.clone(), 1e-6
+    assert gradient.abs().max() > 1e-6
+    for place in range(12):
+        with torch.no_grad():
+            selector[0, place] += step
+            higher = objective()
+            selector[0, place] -= 2 * step
+            lower = objective()
+            selector[0, place] += step
+        assert float((higher - lower) / (2 * step)) == pytest.approx(float(gradient[0, place]), abs=1e-5)
 
 
 def test_the_deployed_policy_sees_what_the_environment_shows(lookup, network, tmp_path):
@@ -208,7 +249,7 @@ def test_training_learns_what_is_rewarded(lookup, tmp_path):
         ("weights.json", lambda path: path.write_text('{"policy": "other"}'), "weights of policy 'other'"),
         (
             "weights.json",
-            lambda path: path.write_text('{"policy": "attention", "steps": 9, "hidden": 128}'),
+            lambda path: path.write_text('{"policy": "attention", "steps": 9, "hidden": 128, "rule": "learned"}'),
             "state_dict",
         ),
     ],

@@ -92,10 +92,33 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
     assert measured["found_in_one_view"] == pytest.approx(np.mean(found))
 
 
+@pytest.mark.parametrize("part", ["steps", "fusion", "verification", "attention"])
+def test_ablations_give_numbers_and_a_figure(banks, tmp_path, part, monkeypatch):
+    monkeypatch.setattr("active6d_agent.ablation.STEPS", (0, 2))
+    file, png = tmp_path / "x.json", tmp_path / "x.png"
+    result = run("ablate", part, "--sample", "6", "--steps", "2", "--banks", str(banks), "--policies", "random",
+                 "--length", "8", "--out", str(tmp_path), "--json", str(file), "--png", str(png))  # fmt: skip
+    assert result.exit_code == 0, result.stderr
+    rows = json.loads(file.read_text())["rows"]
+    variants = {
+        "steps": ["random", "random"],
+        "fusion": ["clustering and exclusion", "clustering alone", "no clustering"],
+        "verification": ["verification score", "estimator's score"],
+        "attention": ["learned", "lowest-score"],
+    }
+    assert [row["variant"] for row in rows] == variants[part]
+    for row in rows:
+        assert row["detection_rate_ci95"][0] <= row["detection_rate"] <= row["detection_rate_ci95"][1]
+    assert png.stat().st_size > 1000
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["evaluate", "--banks", "/nowhere"], "active6d bank --object mug --split test --banks /nowhere"),
+        (["ablate", "alpha", "--banks", "/nowhere"], "active6d bank --object mug --split train --banks /nowhere"),
+        (["ablate", "steps", "--policies", "psychic"], "unknown policy 'psychic'"),
+        (["ablate", "gravity"], "'gravity' is not one of 'alpha'"),
         (["evaluate", "--policies", "psychic"], "unknown policy 'psychic'"),
         (["evaluate", "--steps", "100"], "--steps 100"),
         (["evaluate", "--policies", "random", "--set", "random.gain=1"], "has no parameter 'gain'"),
@@ -107,7 +130,7 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
     ],
 )
 def test_bad_input_is_one_clear_line(banks, arguments, words):
-    if arguments[0] == "evaluate" and "--banks" not in arguments:
+    if arguments[0] in ("evaluate", "ablate") and "--banks" not in arguments:
         arguments = [*arguments, "--banks", str(banks)]
     result = run(*arguments)
     assert result.exit_code == 2

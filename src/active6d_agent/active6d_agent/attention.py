@@ -18,6 +18,8 @@ from active6d_core.object_model import ObjectModel
 #: What a state consists of beside the history: o_t (12) and the camera's position (3).
 _STATE = 15
 _FEATURES = 6
+#: How the attended object is chosen.
+ATTENTION_RULES = ("learned", "lowest-score")
 
 
 class ObjectAttention(nn.Module):
@@ -26,10 +28,20 @@ class ObjectAttention(nn.Module):
     g^i = FC(b^i, d^i, c^i); w^i = Selector(g^i, mean g); the object with the highest softmax weight m is attended, and
     o_t = (g^m times its weight, b^m, d^m, c^m). The choice is hard; gradients reach FC and Selector through g^m and
     through the weight.
+
+    Args:
+        rule: "learned"; or "lowest-score" for the ablation, where the object with the lowest verification score is
+            attended and has all the weight.
+
+    Raises:
+        ValueError: no such rule.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rule: str = "learned") -> None:
         super().__init__()
+        if rule not in ATTENTION_RULES:
+            raise ValueError(f"attention: no rule '{rule}', there are {', '.join(ATTENTION_RULES)}")
+        self.rule = rule
         self.fc = nn.Sequential(nn.Linear(_FEATURES, _FEATURES), nn.ReLU())
         self.selector = nn.Linear(2 * _FEATURES, 1)
 
@@ -50,6 +62,9 @@ class ObjectAttention(nn.Module):
         together = torch.cat([g, pooled[:, None].expand_as(g)], dim=-1)
         score = self.selector(together)[..., 0].masked_fill(~present, -1e9)
         weight = torch.softmax(score, dim=1) * present
+        if self.rule == "lowest-score":
+            lowest = objects[..., -1].masked_fill(~present, torch.inf).argmin(dim=1)
+            weight = nn.functional.one_hot(lowest, objects.shape[1]).to(objects.dtype) * present
         index = weight.argmax(dim=1)
         rows = torch.arange(len(objects), device=objects.device)
         some = present.any(dim=1)
@@ -64,12 +79,13 @@ class AttentionNetwork(nn.Module):
     Args:
         steps: horizon T that the history has room for.
         hidden: units of the hidden layer.
+        rule: of :class:`ObjectAttention`.
     """
 
-    def __init__(self, steps: int = 5, hidden: int = 128) -> None:
+    def __init__(self, steps: int = 5, hidden: int = 128, rule: str = "learned") -> None:
         super().__init__()
         self.steps, self.hidden = steps, hidden
-        self.attention = ObjectAttention()
+        self.attention = ObjectAttention(rule)
         self.policy = nn.Sequential(nn.Linear(_STATE + 3 * steps, hidden), nn.ReLU())
         self.mean = nn.Linear(hidden, 2)
         self.log_std = nn.Parameter(torch.full((2,), -0.5))
@@ -88,7 +104,8 @@ class AttentionNetwork(nn.Module):
 
 def save_network(network: AttentionNetwork, path: Path, provenance: dict | None = None) -> None:
     """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
-    save_weights(network, path, "attention", {"steps": network.steps, "hidden": network.hidden}, provenance)
+    config = {"steps": network.steps, "hidden": network.hidden, "rule": network.attention.rule}
+    save_weights(network, path, "attention", config, provenance)
 
 
 def load_network(path: Path) -> AttentionNetwork:
@@ -97,7 +114,9 @@ def load_network(path: Path) -> AttentionNetwork:
     Raises:
         ValueError: a file is missing, damaged or does not fit; the message names it.
     """
-    return load_weights(path, "attention", lambda config: AttentionNetwork(config["steps"], config["hidden"]))
+    return load_weights(
+        path, "attention", lambda config: AttentionNetwork(config["steps"], config["hidden"], config["rule"])
+    )
 
 
 @register_policy("attention")

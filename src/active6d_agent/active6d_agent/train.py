@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from active6d_agent.attention import AttentionNetwork, ObjectAttention, save_network
+from active6d_agent.attention import ATTENTION_RULES, AttentionNetwork, ObjectAttention, save_network
 from active6d_agent.environment import Active6DVectorEnv, Episodes, RewardParameters
 from active6d_agent.lookup import BankLookup
 
@@ -39,6 +39,7 @@ class TrainingParameters:
         entropy: weight of the entropy bonus.
         seed: of everything.
         evaluate_every: environment steps between evaluations on the validation scenes.
+        attend: which object, see :class:`~active6d_agent.attention.ObjectAttention`.
 
     Raises:
         ValueError: a value is out of range.
@@ -55,6 +56,7 @@ class TrainingParameters:
     entropy: float = 0.0
     seed: int = 0
     evaluate_every: int = 50_000
+    attend: str = "learned"
 
     def __post_init__(self) -> None:
         for name in ("steps", "total", "environments", "rollout", "batch", "epochs", "evaluate_every"):
@@ -62,6 +64,8 @@ class TrainingParameters:
                 raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
         if self.rollout % self.steps:
             raise ValueError(f"training: rollout {self.rollout} must be a multiple of steps {self.steps}")
+        if self.attend not in ATTENTION_RULES:
+            raise ValueError(f"training: attend must be one of {', '.join(ATTENTION_RULES)}, got {self.attend}")
 
 
 class BankVecEnv(VecEnv):
@@ -122,10 +126,10 @@ class BankVecEnv(VecEnv):
 class AttentionExtractor(BaseFeaturesExtractor):
     """The state s_t; remembers the index that the attention chose last, which is part of the action."""
 
-    def __init__(self, observation_space: spaces.Dict) -> None:
+    def __init__(self, observation_space: spaces.Dict, rule: str = "learned") -> None:
         self.steps = observation_space["history"].shape[0]
         super().__init__(observation_space, 15 + 3 * self.steps)
-        self.attention = ObjectAttention()
+        self.attention = ObjectAttention(rule)
         self.attended = torch.zeros(0, dtype=torch.long)
 
     def forward(self, observation: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -179,7 +183,7 @@ class PaperPolicy(ActorCriticPolicy):
     def network(self) -> AttentionNetwork:
         """The deployable part, a copy."""
         extractor = self.features_extractor
-        network = AttentionNetwork(extractor.steps)
+        network = AttentionNetwork(extractor.steps, rule=extractor.attention.rule)
         network.attention.load_state_dict(extractor.attention.state_dict())
         network.policy.load_state_dict(self.mlp_extractor.policy_net.state_dict())
         network.mean.load_state_dict(self.action_net.state_dict())
@@ -265,6 +269,7 @@ def _make_ppo(lookup: BankLookup, parameters: TrainingParameters, reward: Reward
     return PPO(
         PaperPolicy,
         environment,
+        policy_kwargs={"features_extractor_kwargs": {"rule": parameters.attend}},
         learning_rate=parameters.learning_rate,
         n_steps=parameters.rollout,
         batch_size=parameters.batch,

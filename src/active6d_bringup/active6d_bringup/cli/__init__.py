@@ -9,6 +9,7 @@ from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
 from active6d_bringup.cli import (
+    ablate,
     agent_benchmark,
     bank,
     benchmark,
@@ -77,6 +78,7 @@ app.command()(replay.replay)
 app.command()(report.report)
 app.command()(bank.bank)
 app.command()(evaluate.evaluate)
+app.command()(ablate.ablate)
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
 benchmark.app.command()(agent_benchmark.environment)

@@ -1,0 +1,81 @@
+"""Ablations vary what they say they vary, and nothing else."""
+
+import numpy as np
+import pytest
+from synthetic_bank import synthetic_bank
+
+from active6d_agent import ablation
+from active6d_agent.environment import RewardParameters
+from active6d_agent.evaluation import all_starts, run_named
+from active6d_agent.lookup import BankLookup
+from active6d_agent.train import TrainingParameters
+from active6d_core.metrics import evaluate_scene
+
+
+@pytest.fixture(scope="module")
+def lookup():
+    return BankLookup(synthetic_bank("mug", scenes=2, objects=6))
+
+
+@pytest.fixture(scope="module")
+def starts(lookup):
+    return all_starts(lookup, 8, seed=1)
+
+
+def test_budgets_go_from_the_single_view_to_all_views(lookup, starts):
+    rows = {(name, budget): row for name, budget, row in ablation.ablate_steps(lookup, ["random"], starts, (0, 3, 99))}
+    for budget, name in ((0, "single-view"), (99, "all-views")):
+        expected = run_named(lookup, name, starts, budget)
+        assert rows["random", budget]["detection_rate"] == pytest.approx(expected.detection_rate.mean())
+    assert rows["random", 3]["distance_m"] == pytest.approx(run_named(lookup, "random", starts, 3).distance_m.mean())
+
+
+def test_without_clustering_every_hypothesis_is_reported(lookup, starts):
+    rows = dict(ablation.ablate_fusion(lookup.bank, "random", starts, 2))
+    views = run_named(lookup, "random", starts, 2).views
+    reported, rates = [], []
+    for (scene, _), taken in zip(starts, views, strict=True):
+        own = lookup.bank.scenes[scene]
+        reported.append(np.isin(own.view, taken).sum() / len(own.T_world_object))
+        objects = lookup.objects(scene, taken.tolist())
+        rates.append(evaluate_scene(lookup.model, objects.T_world_object, own.T_world_object).detection_rate)
+    assert rows["no clustering"]["reported"] == pytest.approx(np.mean(reported))
+    assert rows["clustering and exclusion"]["detection_rate"] == pytest.approx(np.mean(rates))
+    assert rows["clustering and exclusion"]["reported"] <= rows["clustering alone"]["reported"]
+    at_n = [row["detection_rate_at_n"] for row in rows.values()]
+    assert at_n[0] >= at_n[2], "repetitions crowd out other objects"
+
+
+def test_the_estimators_score_takes_the_verification_scores_place(lookup, starts):
+    bank = ablation.score_by_estimator(lookup.bank)
+    other = BankLookup(bank)
+    np.testing.assert_array_equal(other.verification, other.score)
+    rows = dict(ablation.ablate_fusion(lookup.bank, "random", starts, 2, scores=True))
+    # The made-up estimator's score is its verification score, so nothing may change.
+    assert rows["verification score"] == rows["estimator's score"]
+    reversed_ = [ablation.replace(s, table=s.table.copy()) for s in lookup.bank.scenes]
+    for scene in reversed_:
+        scene.table[:, 8] = 1.0 - scene.table[:, 7]
+    worse = dict(
+        ablation.ablate_fusion(ablation.replace(lookup.bank, scenes=reversed_), "random", starts, 2, scores=True)
+    )
+    assert worse["verification score"] == rows["verification score"]
+    assert worse["estimator's score"]["e_add_mm"] > rows["verification score"]["e_add_mm"]
+
+
+def test_variants_are_trained_once(lookup, starts, tmp_path):
+    banks = dict.fromkeys(("train", "val", "test"), lookup)
+    parameters = TrainingParameters(steps=2, total=40, environments=4, rollout=4, batch=16, evaluate_every=20)
+    variants = {
+        "far": (parameters, RewardParameters(alpha=0.0)),
+        "rule": (ablation.replace(parameters, attend="lowest-score"), RewardParameters()),
+    }
+    seen = []
+    rows = dict(
+        ablation.ablate_training(banks, variants, tmp_path, starts, on_progress=lambda *told: seen.append(told[0]))
+    )
+    assert set(seen) == {"far", "rule"}
+    assert '"rule": "lowest-score"' in (tmp_path / "rule" / "best.json").read_text()
+    seen.clear()
+    assert dict(ablation.ablate_training(banks, variants, tmp_path, starts)) == rows
+    assert not seen
