@@ -135,11 +135,12 @@ def test_ppos_objective_teaches_the_attention(lookup):
     torch.manual_seed(6)
     policy = PaperPolicy(environment.observation_space, environment.action_space, lambda _: 1e-4).double()
     observation = {name: torch.from_numpy(values).double() for name, values in environment.reset().items()}
-    actions = policy.forward(observation)[0].detach()
-    advantage = torch.randn(6, dtype=torch.float64)
+    angles, advantage = torch.randn(6, 2, dtype=torch.float64), torch.randn(6, dtype=torch.float64)
 
     def objective():
-        return (policy.evaluate_actions(observation, actions)[1] * advantage).sum()
+        # As in evaluate_actions, which casts observations to single precision.
+        latent, _ = policy.mlp_extractor(policy.features_extractor(observation))
+        return (policy._get_action_dist_from_latent(latent).log_prob(angles) * advantage).sum()
 
     selector = policy.features_extractor.attention.selector.weight
     objective().backward()
