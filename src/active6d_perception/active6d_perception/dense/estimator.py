@@ -194,7 +194,9 @@ class DenseEstimator:
         evidence = weigh_evidence(self._views, T, depth, normals, view.camera)
         # Of the surface that nothing hides, how much is measured where it should be; a sliver is weak evidence.
         fit = np.clip(evidence.fitting - evidence.violated, 0.0, 1.0) / np.maximum(1.0 - evidence.occluded, _SLIVER)
-        judged = Poses(T, np.sqrt(fit * poses.score) * poses.certainty, poses.instance, poses.certainty)
+        # An instance is there whichever way it is turned, so an unknown turn halves the score at most.
+        score = np.sqrt(fit * poses.score) * 0.5 * (1.0 + poses.certainty)
+        judged = Poses(T, score, poses.instance, poses.certainty)
         return self._report(judged, points, candidates, view)
 
     def _report(
