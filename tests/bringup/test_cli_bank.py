@@ -92,6 +92,30 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
     assert measured["found_in_one_view"] == pytest.approx(np.mean(found))
 
 
+def test_a_scene_is_seen_as_the_graph_sees_it(monkeypatch):
+    """Simulator, estimator and verification from two views; float32 tables of what they say."""
+    from active6d_core.object_model import load_object
+    from active6d_core.view_sphere import ViewSphere
+    from active6d_perception.estimator import create_estimator
+    from active6d_perception.verification import Verifier
+    from active6d_sim.scene_store import load_scene
+    from active6d_sim.simulator import Simulator
+
+    sphere = ViewSphere(elevations_degrees=(60.0,), azimuths=2)
+    monkeypatch.setattr("active6d_core.view_sphere.ViewSphere", lambda: sphere)
+    made = bank_command.observe_scene_by_name("bunny/test/0", estimator="geometric", noise=1.0, seed=5)
+    scene, model = load_scene("bunny", "test", 0), load_object("bunny")
+    view = Simulator(scene, seed=5).capture(sphere.pose(sphere.positions[1]), 2_000_000_000)
+    found = create_estimator("geometric", model).estimate(view)
+    own = made.table[made.view == 1]
+    assert made.name == "bunny/test/0"
+    assert len(found) > 0
+    np.testing.assert_array_equal(made.T_world_object, scene.T_world_object)
+    np.testing.assert_allclose(own[:, :3], found.T_camera_object[:, :3, 3], atol=1e-6)
+    np.testing.assert_allclose(own[:, 7], Verifier(model).score(view.depth, view.camera, found), atol=1e-6)
+    np.testing.assert_allclose(own[:, 8], found.score, atol=1e-6)
+
+
 @pytest.mark.parametrize("part", ["steps", "fusion", "verification", "attention"])
 def test_ablations_give_numbers_and_a_figure(banks, tmp_path, part, monkeypatch):
     monkeypatch.setattr("active6d_agent.ablation.STEPS", (0, 2))
