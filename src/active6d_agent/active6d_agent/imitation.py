@@ -75,7 +75,7 @@ class ImitationParameters:
     capacity: int = 12_000
     starts: int = 150
     evaluate_every: int = 5
-    hidden: int = 48
+    hidden: int = 32
     seed: int = 0
 
     def __post_init__(self) -> None:

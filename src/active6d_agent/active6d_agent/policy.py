@@ -48,13 +48,16 @@ class Observation:
 
     def visited(self) -> np.ndarray:
         """(M,) bool, views of the grid that the camera has taken."""
-        arcs = self.sphere.arc(self.sphere.positions[:, None], self.positions[None])
-        return arcs.min(axis=1) < VISITED_WITHIN
+        grid, taken = self.sphere.positions / self.sphere.radius, self.positions
+        taken = taken / np.linalg.norm(taken, axis=1, keepdims=True)
+        return (grid @ taken.T).max(axis=1) > np.cos(VISITED_WITHIN / self.sphere.radius)
 
     def candidates(self) -> np.ndarray:
         """(M,) bool, views that may be next: reachable, not visited, within the metres left."""
-        affordable = self.sphere.arc(self.sphere.positions, self.positions[-1]) <= self.metres_left
-        return self.allowed & affordable & ~self.visited()
+        candidates = self.allowed & ~self.visited()
+        if self.metres_left < np.inf:
+            candidates &= self.sphere.arc(self.sphere.positions, self.positions[-1]) <= self.metres_left
+        return candidates
 
 
 @dataclass(frozen=True, eq=False)

@@ -108,7 +108,7 @@ class ViewAttention(nn.Module):
     """
 
     def __init__(
-        self, diameter: float, axis: Sequence[float] | None = None, hidden: int = 48, weighing: Weighing = Weighing()
+        self, diameter: float, axis: Sequence[float] | None = None, hidden: int = 32, weighing: Weighing = Weighing()
     ) -> None:
         super().__init__()
         self.diameter, self.axis, self.hidden, self.weighing = diameter, axis, hidden, weighing
@@ -272,7 +272,7 @@ def load_network(path: Path, object_name: str) -> ViewAttention:
     return load_weights(path, "view-attention", build)
 
 
-def new_network(model: ObjectModel, hidden: int = 48) -> ViewAttention:
+def new_network(model: ObjectModel, hidden: int = 32) -> ViewAttention:
     """An untrained network for an object."""
     axis = model.symmetry.axis
     return ViewAttention(float(model.diameter), None if axis is None else axis.tolist(), hidden)
