@@ -110,7 +110,7 @@ def _poses(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def _status(stamp: int, message: str, **values: str) -> DiagnosticArray:
-    status = DiagnosticStatus(name="/pose_estimator", message=message)
+    status = DiagnosticStatus(name="/pose_estimator", message=message, hardware_id="active6d")
     status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
     report = DiagnosticArray(status=[status])
     report.header.stamp = conversions.ns_to_stamp(stamp)

@@ -5,6 +5,7 @@ import contextlib
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -251,6 +252,25 @@ def test_attention_comes_back(attended):
     weight, index = conversions.attention_from_cloud(through_the_wire(cloud), "world")
     np.testing.assert_allclose(weight, [0.2, 0.3, 0.5], atol=1e-7)
     assert index == attended
+
+
+def test_tables_too_long_for_any_heap_are_refused():
+    hypotheses = random_hypotheses(3)
+    cloud = conversions.hypotheses_to_cloud(hypotheses, 1, FRAME)
+    copies = 2001 // len(hypotheses) + 1
+    cloud.width *= copies
+    cloud.row_step *= copies
+    cloud.data *= copies
+    with pytest.raises(MessageError, match="more than 2000"):
+        conversions.hypotheses_from_cloud(cloud, hypotheses.segmentation, FRAME)
+
+
+@pytest.mark.parametrize(
+    ("value", "hardware", "expected"), [("1.5", "active6d", {"n": 1.5}), ("soon", "active6d", {}), ("1.5", "x", {})]
+)
+def test_latencies_are_read_from_our_nodes_only(value, hardware, expected):
+    status = DiagnosticStatus(name="/ns/n", hardware_id=hardware, values=[KeyValue(key="latency_ms", value=value)])
+    assert conversions.latencies_from_diagnostics(DiagnosticArray(status=[status])) == expected
 
 
 def test_markers_colour_by_verification_and_clear_the_last_ones():

@@ -206,8 +206,11 @@ def test_a_replacement_is_taken_until_the_set_is_complete():
         synchronizer.add("b", 0, "b")
 
 
-def test_incomplete_sets_do_not_pile_up():
+def test_incomplete_sets_do_not_pile_up_unnoticed():
     synchronizer = StampSynchronizer("ab", lambda stamp, values: None, depth=4)
-    for stamp in range(100):
+    for stamp in range(4):
         synchronizer.add("a", stamp, None)
+    for stamp in range(4, 100):
+        with pytest.raises(MessageError, match="is dropped: no b for it"):
+            synchronizer.add("a", stamp, None)
     assert sorted(synchronizer.missing()) == [96, 97, 98, 99]

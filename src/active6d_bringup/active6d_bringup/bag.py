@@ -22,6 +22,7 @@ from active6d_core.conversions import (
     image_to_depth,
     image_to_segmentation,
     info_to_camera,
+    latencies_from_diagnostics,
     objects_from_cloud,
     pose_stamped_to_transform,
     poses_from_array,
@@ -185,7 +186,7 @@ def _read_messages(folder: Path) -> tuple[dict[str, dict[int, Any]], dict[int, d
                 message = TYPESTORE.deserialize_cdr(payload, connection.msgtype)
                 topic = names[connection.topic]
                 if topic == "/diagnostics":
-                    _collect_latencies(message, latencies)
+                    latencies[stamp_to_ns(message.header.stamp)].update(latencies_from_diagnostics(message))
                 elif hasattr(message, "header"):
                     messages[topic][stamp_to_ns(message.header.stamp)] = message
     except BagError:
@@ -194,13 +195,6 @@ def _read_messages(folder: Path) -> tuple[dict[str, dict[int, Any]], dict[int, d
     except Exception as error:
         raise BagError(f"{folder}: damaged bag ({error})") from error
     return messages, latencies
-
-
-def _collect_latencies(message: Any, latencies: dict[int, dict[str, float]]) -> None:
-    for status in message.status:
-        values = {pair.key: pair.value for pair in status.values}
-        if "latency_ms" in values:
-            latencies[stamp_to_ns(message.header.stamp)][status.name.rsplit("/", 1)[-1]] = float(values["latency_ms"])
 
 
 def _episodes(folder: Path, messages: dict[str, dict[int, Any]], latencies: dict) -> list[EpisodeRecord]:

@@ -28,6 +28,7 @@ from active6d_bringup.composition import (
 )
 from active6d_bringup.recording import RecordingError, describe_missing
 from active6d_core.conversions import (
+    latencies_from_diagnostics,
     objects_from_cloud,
     pose_stamped_to_transform,
     poses_from_array,
@@ -385,11 +386,8 @@ class EpisodeMonitor(Node):
         self._ended = time.monotonic()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            latency = {pair.key: pair.value for pair in status.values}.get("latency_ms")
-            if latency is not None:
-                by_node = self._latencies.setdefault(stamp_to_ns(message.header.stamp), {})
-                by_node[status.name.rsplit("/", 1)[-1]] = float(latency)
+        latencies = latencies_from_diagnostics(message)
+        self._latencies.setdefault(stamp_to_ns(message.header.stamp), {}).update(latencies)
 
 
 def _values(message: DiagnosticArray) -> dict[str, str]:

@@ -6,10 +6,12 @@ message objects that rosbags deserialises.
 """
 
 import array
+import re
 from copy import copy
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion, Vector3
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
@@ -37,6 +39,12 @@ _DATATYPES = {"<f4": PointField.FLOAT32, "<u2": PointField.UINT16, "|u1": PointF
 _COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
 #: A quaternion whose norm is further from one than this was not meant as a rotation.
 _QUATERNION_TOLERANCE = 1e-2
+
+
+#: What marks a diagnostic status as one of this project's nodes.
+HARDWARE_ID = "active6d"
+#: More rows than any heap needs; fusion's memory grows with their square.
+_MAX_ROWS = 2000
 
 
 class MessageError(ValueError):
@@ -350,6 +358,8 @@ def _cloud_to_table(message: PointCloud2, columns: dict[str, str], frame: str) -
     if message.is_bigendian:
         raise MessageError("big-endian tables are not supported")
     rows = message.width * message.height
+    if rows > _MAX_ROWS:
+        raise MessageError(f"table of {rows} rows, more than {_MAX_ROWS}")
     if message.row_step != message.point_step * message.width or len(message.data) != message.row_step * message.height:
         raise MessageError(
             f"table of {rows} rows has steps {message.point_step}, {message.row_step} and {len(message.data)} bytes"
@@ -394,6 +404,19 @@ def _read_poses(table: np.ndarray) -> np.ndarray:
 
 def _read_box(table: np.ndarray) -> np.ndarray:
     return np.stack([_read(table, column) for column in _BOX_COLUMNS], axis=1)
+
+
+# Diagnostics
+
+
+def latencies_from_diagnostics(message: DiagnosticArray) -> dict[str, float]:
+    """Milliseconds that this project's nodes worked on a view, by node name; others' statuses are ignored."""
+    latencies = {}
+    for status in message.status:
+        value = {pair.key: pair.value for pair in status.values}.get("latency_ms", "")
+        if status.hardware_id == HARDWARE_ID and re.fullmatch(r"\d+(\.\d+)?", value):
+            latencies[status.name.rsplit("/", 1)[-1]] = float(value)
+    return latencies
 
 
 # Markers

@@ -23,7 +23,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from active6d_core.conversions import MessageError, ns_to_stamp
+from active6d_core.conversions import HARDWARE_ID, MessageError, ns_to_stamp
 
 # Both ends: a reliable writer forgets what its queue cannot hold, received by everybody or not.
 _QUEUE_DEPTH = 10
@@ -162,7 +162,7 @@ class GraphNode(LifecycleNode):
     def _diagnose(self, level: bytes, message: str, stamp: int, values: dict[str, str]) -> None:
         values = {**values, "views": str(self._views_measured), "rejected": str(self._rejected)}
         status = DiagnosticStatus(
-            level=level, name=self.get_fully_qualified_name(), message=message, hardware_id="active6d"
+            level=level, name=self.get_fully_qualified_name(), message=message, hardware_id=HARDWARE_ID
         )
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         report = DiagnosticArray(status=[status])
@@ -242,10 +242,10 @@ class StampSynchronizer:
     Args:
         names: what makes a set complete.
         callback: called with the stamp (ns) and {name: value}.
-        depth: incomplete stamps kept; the oldest is dropped first.
+        depth: incomplete stamps kept, more than a latched topic repeats; the oldest is dropped first.
     """
 
-    def __init__(self, names: Sequence[str], callback: Callable[[int, dict[str, Any]], None], depth: int = 8) -> None:
+    def __init__(self, names: Sequence[str], callback: Callable[[int, dict[str, Any]], None], depth: int = 16) -> None:
         self._names = frozenset(names)
         self._callback = callback
         self._depth = depth
@@ -256,12 +256,14 @@ class StampSynchronizer:
         """Take a value; a second one for an incomplete stamp replaces the first (its sender was restarted).
 
         Raises:
-            MessageError: the stamp was completed already, or is older than the last complete one.
+            MessageError: the stamp was completed already, or is older than the last complete one; or, with the value
+                taken, an older incomplete set had to make room.
         """
         if stamp <= self._last_complete:
             kind = "duplicate" if stamp == self._last_complete else "stale"
             raise MessageError(
-                f"{kind} stamp {stamp * 1e-9:.3f} s of {name}, already at {self._last_complete * 1e-9:.3f} s"
+                f"{kind} stamp {stamp * 1e-9:.3f} s of {name}, already at {self._last_complete * 1e-9:.3f} s; "
+                "a camera whose stamps begin anew needs the other nodes started anew, too"
             )
         self._pending.setdefault(stamp, {})[name] = value
         if self._pending[stamp].keys() == self._names:
@@ -270,7 +272,9 @@ class StampSynchronizer:
             self._pending = {later: kept for later, kept in self._pending.items() if later > stamp}
             self._callback(stamp, values)
         elif len(self._pending) > self._depth:
-            del self._pending[min(self._pending)]
+            oldest = min(self._pending)
+            absent = ", ".join(sorted(self._names - self._pending.pop(oldest).keys()))
+            raise MessageError(f"view of {oldest * 1e-9:.3f} s is dropped: no {absent} for it")
 
     def missing(self) -> dict[int, set[str]]:
         """Names still awaited, per incomplete stamp."""

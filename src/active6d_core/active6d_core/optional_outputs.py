@@ -55,9 +55,7 @@ def transforms_message(messages: ModuleType, T_parent_children: dict[str, np.nda
     for child, T in T_parent_children.items():
         pose = transform_to_pose(T)
         p, q = pose.position, pose.orientation
-        transform = Transform(
-            translation=Vector3(x=p.x, y=p.y, z=p.z), rotation=Quaternion(x=q.x, y=q.y, z=q.z, w=q.w)
-        )
+        transform = Transform(translation=Vector3(x=p.x, y=p.y, z=p.z), rotation=Quaternion(x=q.x, y=q.y, z=q.z, w=q.w))
         transforms.append(
             TransformStamped(header=make_header(stamp, parent), child_frame_id=child, transform=transform)
         )
