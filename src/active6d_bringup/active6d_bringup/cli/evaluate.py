@@ -97,8 +97,8 @@ def _table(summary: dict[str, Any]) -> "Table":
 
     title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals)"
     table = Table(box=None, pad_edge=False, title=title)
-    table.add_column("policy", header_style="dim")
-    for column in ("d [m]", "e_ADD [mm]", "", "detection rate", "", "gap closed"):
+    table.add_column("policy", header_style="dim", no_wrap=True, min_width=max(map(len, summary["policies"])))
+    for column in ("d [m]", "e_ADD [mm]", "", "detected", "", "gap closed"):
         table.add_column(column, justify="right", header_style="dim")
     for name, row in summary["policies"].items():
         error, rate, gap = row["e_add_mm_ci95"], row["detection_rate_ci95"], row["gap_closed"]
