@@ -27,14 +27,14 @@ class DecodingParameters:
         pixels: most pixels per instance that take part in the fit.
         fewest_pixels: an instance with fewer is dropped.
         tolerance: residual of a correspondence that counts half.
-        coordinates: fit object coordinates to points; without it, poses come from the votes for centre and axis alone.
+        coordinates: fit object coordinates to points; otherwise poses come from the votes for centre and axis alone.
     """
 
     mask_threshold: float = 0.5
     pixels: int = 160
     fewest_pixels: int = 12
     tolerance: float = 0.05
-    coordinates: bool = True
+    coordinates: bool = False
 
 
 @dataclass(frozen=True, eq=False)
