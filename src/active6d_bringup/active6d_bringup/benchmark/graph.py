@@ -147,8 +147,7 @@ def measure_graph(
 ) -> dict[str, Any]:
     """Compare the composed graph with direct calls, view by view.
 
-    Times are the fastest of the repeats, view by view, since other load on the machine only adds to them; medians
-    stand beside them.
+    Times are medians of the repeats, view by view.
 
     Args:
         object_name: what is in the bin.
@@ -162,8 +161,7 @@ def measure_graph(
         ``overhead_ms``: mean over the views of graph minus direct, milliseconds a view, without a recorder;
         ``overhead_recorded_ms``: the same with a recorder in the graph, which compresses and writes everything;
         ``graph_ms``, ``recorded_ms``, ``direct_ms``: the times a view themselves; ``fusion_ms`` and ``fusion_hz``:
-        verification and fusion of the last view by direct call; ``median_*``: of the repeats instead of the fastest;
-        ``image_bytes``: of one view's images.
+        verification and fusion of the last view by direct call; ``image_bytes``: of one view's images.
     """
     on_progress("rendering views", 0, 1)
     prepared = prepare_views(object_name, seed, views, hypotheses)
@@ -186,14 +184,13 @@ def measure_graph(
         "hypotheses": hypotheses,
         "repeats": repeats,
         "image_bytes": first.color.nbytes + first.depth.nbytes + first.depth.size * 2,
-        **_summary(times, np.min),
-        **{f"median_{key}": value for key, value in _summary(times, np.median).items()},
+        **_summary(times),
     }
 
 
-def _summary(times: dict[str, list[np.ndarray]], statistic: Callable) -> dict[str, float]:
-    """Milliseconds a view by kind of episode; ``statistic`` is taken over the repeats of each view."""
-    per_view = {kind: 1e3 * statistic(samples, axis=0) for kind, samples in times.items()}
+def _summary(times: dict[str, list[np.ndarray]]) -> dict[str, float]:
+    """Milliseconds a view by kind of episode, from the median of each view's repeats."""
+    per_view = {kind: 1e3 * np.median(samples, axis=0) for kind, samples in times.items()}
     return {
         "overhead_ms": float((per_view["graph"] - per_view["direct"]).mean()),
         "overhead_recorded_ms": float((per_view["recorded"] - per_view["direct"]).mean()),

@@ -20,7 +20,7 @@ def graph(
     seed: Seed = 0,
     views: Annotated[int, typer.Option(min=2, help="Views of one episode.")] = 11,
     hypotheses: Annotated[int, typer.Option(min=1, help="Hypotheses a view.")] = 20,
-    repeats: Annotated[int, typer.Option(min=1, help="Episodes; a view's time is the fastest of them.")] = 5,
+    repeats: Annotated[int, typer.Option(min=1, help="Episodes; a view's time is their median.")] = 5,
     json_file: JsonFile = None,
 ) -> None:
     """Compare the node graph with calling the core functions, and time verification and fusion.
