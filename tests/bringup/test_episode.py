@@ -112,6 +112,12 @@ def test_camera_that_stops_answering_is_named(tmp_path):
     assert len(read_episode(tmp_path / "bag").steps) == 2
 
 
+def test_what_a_node_refused_is_told(tmp_path):
+    elsewhere = settings(overrides={"attention_policy": {"world_frame": "map"}}, patience=1.0)
+    with pytest.raises(EpisodeError, match=r"/attention_policy refused .*frame_id is 'world', expected 'map'"):
+        run_episode(elsewhere)
+
+
 def test_wrong_settings_are_one_clear_line(tmp_path):
     with pytest.raises(RecordingError, match="exists already"):
         run_episode(settings(tmp_path))

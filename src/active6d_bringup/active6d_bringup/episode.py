@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.context import Context
 from rclpy.node import Node
@@ -258,9 +258,8 @@ def _spin_to_end(
             note(f"the bag is not complete: no answer from {describe_missing(unrecorded)}")
             return
         if idle > patience:
-            raise EpisodeError(
-                f"no progress for {patience:.0f} s: no answer from {describe_missing(awaited or unrecorded)}"
-            )
+            silent = f"no progress for {patience:.0f} s: no answer from {describe_missing(awaited or unrecorded)}"
+            raise EpisodeError("; ".join([silent, *monitor.last_refusal]))
         graph.spin_once(0.1)
 
 
@@ -273,6 +272,8 @@ class EpisodeMonitor(Node):
         )
         self.received = 0
         self.end_stamp: int | None = None
+        #: What a node last refused and why, in words; empty if none did.
+        self.last_refusal: list[str] = []
         self._on_step = on_step
         self._reported: set[int] = set()
         self._poses: dict[int, np.ndarray] = {}
@@ -386,6 +387,9 @@ class EpisodeMonitor(Node):
         self._ended = time.monotonic()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.level == DiagnosticStatus.ERROR:
+                self.last_refusal = [f"{status.name} refused {status.message}"]
         latencies = latencies_from_diagnostics(message)
         self._latencies.setdefault(stamp_to_ns(message.header.stamp), {}).update(latencies)
 
