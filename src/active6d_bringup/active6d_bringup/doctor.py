@@ -76,7 +76,6 @@ def _libraries() -> Iterator[Check]:
         "numpy": "numpy",
         "scipy": "scipy",
         "trimesh": "trimesh",
-        "pybullet": "pybullet",
         "open3d": "open3d",
         "rosbags": "rosbags",
         "jinja2": "jinja2",
@@ -86,6 +85,8 @@ def _libraries() -> Iterator[Check]:
     for module, distribution in needed.items():
         yield _import_check("Python libraries", module, distribution, needed=True, mend=PIP)
     optional = {
+        # The wrapper, since pybullet itself prints a banner.
+        "active6d_sim.bullet": ("pybullet", "new heaps in the simulator; a robot needs none"),
         "torch": ("torch", "learned estimator, policies and training"),
         "safetensors": ("safetensors", "weights"),
         "gymnasium": ("gymnasium", "training policies"),
@@ -139,7 +140,7 @@ def _ros() -> Iterator[Check]:
         yield _import_check("ROS 2", module, package, needed=True, mend=pip_ros)
     for module, purpose in (
         ("vision_msgs", "Detection3DArray output"),
-        ("tf2_ros", "/tf output"),
+        ("tf2_msgs", "/tf output"),
         ("launch_ros", "launch files"),
     ):
         mend = f"{APT_ROS}{module.replace('_', '-')} ({purpose})"
@@ -152,7 +153,8 @@ def _ros() -> Iterator[Check]:
 
 def _project() -> Iterator[Check]:
     for package in ("active6d_core", "active6d_sim", "active6d_perception", "active6d_agent", "active6d_bringup"):
-        yield _import_check("active6d", package, package, needed=True, mend="pip install -e src/" + package)
+        needed = package != "active6d_sim"  # a robot has its own camera
+        yield _import_check("active6d", package, package, needed=needed, mend="pip install -e src/" + package)
     mend = "mend the description it names, or ACTIVE6D_OBJECT_PATH, which adds folders"
     yield _attempt("active6d", "object models", _load_objects, mend)
     yield _weights()
