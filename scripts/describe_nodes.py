@@ -3,10 +3,8 @@
 Run it after changing a parameter or a topic: `.venv/bin/python scripts/describe_nodes.py`
 """
 
-import inspect
 import re
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 
 import yaml
@@ -14,33 +12,18 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy
 
+from active6d_bringup.composition import NODES, load_node_type
 from active6d_core.node import GraphNode
 
 ROOT = Path(__file__).parents[1]
 PARAMETER_FILE = ROOT / "src/active6d_bringup/config/active6d.yaml"
 GRAPH_PAGE = ROOT / "docs/graph.md"
-NODES = {
-    "camera_simulator": "active6d_sim",
-    "dataset_camera": "active6d_sim",
-    "pose_estimator": "active6d_perception",
-    "hypothesis_fusion": "active6d_perception",
-    "attention_policy": "active6d_agent",
-    "episode_recorder": "active6d_bringup",
-    "bag_player": "active6d_bringup",
-}
 # What rclpy itself declares: every node has it, nobody sets it in a file.
 FOREIGN = ("qos_overrides.", "use_sim_time", "start_type_description_service")
 HEADER = """\
 # Every parameter of every node at its default; `ros2 run PACKAGE NODE --ros-args --params-file THIS_FILE`.
 # Written by scripts/describe_nodes.py.
 """
-
-
-def node_type(package: str, executable: str) -> type[GraphNode]:
-    """The node class of an executable."""
-    module = import_module(f"{package}.nodes.{executable}")
-    classes = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
-    return next(c for c in classes if issubclass(c, GraphNode))
 
 
 def parameters(node: GraphNode) -> Iterator[tuple[Parameter, str, str]]:
@@ -106,10 +89,10 @@ def main() -> None:
     context = Context()
     context.init()
     page, sections = GRAPH_PAGE.read_text(), []
-    for executable, package in NODES.items():
-        node = node_type(package, executable)(context=context)
-        sections.append(parameter_section(executable, node))
-        marked = rf"(<!-- tables of {executable} -->\n).*?(<!-- end -->)"
+    for name in reversed(NODES):  # from the camera on, as the data go
+        node = load_node_type(name)(context=context)
+        sections.append(parameter_section(name, node))
+        marked = rf"(<!-- tables of {name} -->\n).*?(<!-- end -->)"
         tables = page_section(node)
         page = re.sub(marked, lambda match, tables=tables: f"{match[1]}{tables}\n{match[2]}", page, flags=re.DOTALL)
         node.destroy_node()

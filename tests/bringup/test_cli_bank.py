@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from synthetic_bank import synthetic_bank
 from typer.testing import CliRunner
 
 from active6d_agent.bank import bank_path, find_bank, load_bank
@@ -16,15 +15,6 @@ from active6d_bringup.cli import bank as bank_command
 
 def run(*arguments: str):
     return CliRunner().invoke(app, list(arguments), env={"COLUMNS": "200", "TERM": "dumb"})
-
-
-@pytest.fixture(scope="module")
-def banks(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("banks")
-    made = synthetic_bank("mug", scenes=2, objects=6)
-    for split in ("train", "val", "test"):
-        made.save(bank_path(folder, "mug", split))
-    return folder
 
 
 def test_table_1_is_the_policies_episodes(banks, tmp_path):
