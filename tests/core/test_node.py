@@ -1,5 +1,6 @@
 """The base of every node: parameters, guarded inputs, diagnostics, lifecycle and the matching of stamps."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from hypothesis import given
 from hypothesis import strategies as st
+from rclpy.context import Context
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_harness import fresh_domain
 from sensor_msgs.msg import Image
@@ -214,3 +216,22 @@ def test_incomplete_sets_do_not_pile_up_unnoticed():
         with pytest.raises(MessageError, match="is dropped: no b for it"):
             synchronizer.add("a", stamp, None)
     assert sorted(synchronizer.missing()) == [96, 97, 98, 99]
+
+
+def test_a_destroyed_node_leaves_no_threads():
+    def threads():
+        return len(os.listdir("/proc/self/task"))
+
+    context = Context()
+    context.init(args=[], domain_id=fresh_domain())
+    gc.disable()  # rclpy by itself leaves a lifecycle node's participant to the garbage collector
+    try:
+        before = threads()
+        node = DepthNode(context=context)
+        node.start()
+        assert threads() > before
+        node.destroy_node()
+        assert threads() == before
+    finally:
+        gc.enable()
+        context.try_shutdown()

@@ -2,6 +2,7 @@
 
 import pytest
 from rclpy.context import Context
+from ros_harness import fresh_domain
 
 from active6d_bringup.composition import NODES, load_node_type
 
@@ -10,7 +11,7 @@ from active6d_bringup.composition import NODES, load_node_type
 def node(request):
     """Each node at its defaults, not configured."""
     context = Context()
-    context.init()
+    context.init(args=[], domain_id=fresh_domain())
     node = load_node_type(request.param)(context=context)
     assert node.get_name() == request.param
     yield node

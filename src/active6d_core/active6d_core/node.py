@@ -213,6 +213,15 @@ class GraphNode(LifecycleNode):
         self._active = False
         return self._attempt(self.teardown)
 
+    def destroy_node(self) -> None:
+        """Destroy the node, and with the last one of its context the DDS participant.
+
+        rclpy leaves a lifecycle node's state machine to the garbage collector, and with it node and participant: a
+        process that makes many nodes would carry the threads of all of them, and their discovery can deadlock.
+        """
+        self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
+
     def _attempt(self, step: Callable[[], None]) -> TransitionCallbackReturn:
         try:
             step()
