@@ -6,7 +6,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from active6d_agent import baselines
-from active6d_agent.policy import create_policy, list_policies, softmax, uniform_attention
+from active6d_agent import policy as policy_module
+from active6d_agent.policy import choose_policy, create_policy, list_policies, softmax, uniform_attention
 from active6d_core.view_sphere import ViewSphere
 
 SPHERE = ViewSphere()
@@ -237,3 +238,12 @@ def test_attention_weights_sum_to_one(logits):
     for weights in (softmax(np.array(logits)), uniform_attention(len(logits))):
         assert len(weights) == len(logits)
         assert weights.sum() == pytest.approx(1.0 if logits else 0.0)
+
+
+def test_auto_is_the_learned_policy_where_its_weights_ship(model, tmp_path, monkeypatch):
+    monkeypatch.setattr(policy_module, "SHIPPED_WEIGHTS", tmp_path)
+    assert choose_policy("mug") == "lowest-score"
+    assert type(create_policy("auto", model)) is type(create_policy("lowest-score", model))
+    (tmp_path / "view-attention_mug.safetensors").touch()
+    assert choose_policy("mug") == "view-attention"
+    assert choose_policy("bunny") == "lowest-score"

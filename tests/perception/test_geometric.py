@@ -12,7 +12,8 @@ from active6d_core.metrics import add_s, e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimator import create_estimator, list_estimators, register_estimator
+from active6d_perception import estimator as estimator_module
+from active6d_perception.estimator import choose_estimator, create_estimator, list_estimators, register_estimator
 from active6d_perception.evaluation import LabelledView, detection_over_views, evaluate_estimator
 from active6d_perception.refinement import suppress
 from active6d_sim.heap import drop_heap
@@ -117,3 +118,12 @@ def test_suppression_keeps_the_best_of_neighbours():
     distance = np.abs(position[:, None] - position)
     kept = suppress(distance, np.array([0.5, 0.9, 0.3, 0.4, 0.1]), 2.0)
     np.testing.assert_array_equal(kept, [1, 3, 4])
+
+
+def test_auto_is_the_learned_estimator_where_its_weights_ship(tmp_path, monkeypatch):
+    monkeypatch.setattr(estimator_module, "SHIPPED_WEIGHTS", tmp_path)
+    assert choose_estimator("mug") == "geometric"
+    assert type(create_estimator("auto", load_object("mug"))) is type(create_estimator("geometric", load_object("mug")))
+    (tmp_path / "mug.safetensors").touch()
+    assert choose_estimator("mug") == "dense"
+    assert choose_estimator("bunny") == "geometric"

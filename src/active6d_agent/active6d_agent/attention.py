@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from active6d_agent.environment import MAX_OBJECTS
-from active6d_agent.policy import Decision, Observation, register_policy
-from active6d_agent.weights_file import load_weights, save_weights, shipped_weights
+from active6d_agent.policy import Decision, Observation, register_policy, shipped_weights
+from active6d_agent.weights_file import load_weights, save_weights
 from active6d_core.object_model import ObjectModel
 
 #: What a state consists of beside the history: o_t (12) and the camera's position (3).

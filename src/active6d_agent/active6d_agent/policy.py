@@ -9,6 +9,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -17,6 +18,10 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 
+#: The name of what :func:`choose_policy` chooses.
+AUTOMATIC = "auto"
+#: Trained policies that come with this package.
+SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
 #: A view of the grid counts as visited when the camera was this close to it, metres of arc.
 VISITED_WITHIN = 0.01
 
@@ -124,26 +129,38 @@ def register_policy(name: str) -> Callable[[_PolicyFactory], _PolicyFactory]:
 
 
 def list_policies() -> list[str]:
-    """Names of all policies."""
+    """Names of all policies, which ``auto`` is none of."""
     return sorted({*_registry, *(name for names in _MODULES.values() for name in names)})
+
+
+def shipped_weights(policy: str, object_name: str) -> Path:
+    """Where the shipped weights of a policy for an object are, or would be."""
+    return SHIPPED_WEIGHTS / f"{policy}_{object_name}.safetensors"
+
+
+def choose_policy(object_name: str) -> str:
+    """What ``auto`` stands for: the learned policy where weights ship for the object, else the best heuristic."""
+    return "view-attention" if shipped_weights("view-attention", object_name).is_file() else "lowest-score"
 
 
 def create_policy(name: str, model: ObjectModel, **parameters: Any) -> Policy:
     """Make a policy by name.
 
     Args:
-        name: one of :func:`list_policies`.
+        name: one of :func:`list_policies`, or ``auto`` for :func:`choose_policy`'s choice.
         model: the object that fills the bin.
         parameters: of that policy; its class documents them.
 
     Raises:
         ValueError: no such policy, no such parameter, or a value out of range; the message names it.
     """
+    if name == AUTOMATIC:
+        name = choose_policy(model.name)
     for module, names in _MODULES.items():
         if name in names:
             import_module(module)
     if name not in _registry:
-        raise ValueError(f"unknown policy '{name}'; known: {', '.join(list_policies())}")
+        raise ValueError(f"unknown policy '{name}'; known: {', '.join([AUTOMATIC, *list_policies()])}")
     factory = _registry[name]
     accepted = [item for item in inspect.signature(factory).parameters if item != "model"]
     unknown = sorted(parameters.keys() - set(accepted))

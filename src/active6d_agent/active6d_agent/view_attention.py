@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from active6d_agent.policy import Decision, Observation, register_policy
-from active6d_agent.weights_file import load_weights, save_weights, shipped_weights
+from active6d_agent.policy import Decision, Observation, register_policy, shipped_weights
+from active6d_agent.weights_file import load_weights, save_weights
 from active6d_core.object_model import ObjectModel
 
 #: Objects beyond these are left out, the best verified being kept.

@@ -8,14 +8,7 @@ from typing import TypeVar
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
-
 _Module = TypeVar("_Module", bound=nn.Module)
-
-
-def shipped_weights(policy: str, object_name: str) -> Path:
-    """Where the shipped weights of a policy for an object are, or would be."""
-    return SHIPPED_WEIGHTS / f"{policy}_{object_name}.safetensors"
 
 
 def save_weights(module: nn.Module, path: Path, policy: str, config: dict, provenance: dict | None = None) -> None:

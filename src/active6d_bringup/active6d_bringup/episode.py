@@ -73,7 +73,7 @@ class EpisodeSettings:
     object: str = "mug"
     seed: int = 0
     scene: str | None = None
-    policy: str = "lowest-score"
+    policy: str = "auto"
     steps: int = 5
     metres: float | None = None
     estimator: str | None = None

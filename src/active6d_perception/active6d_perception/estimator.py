@@ -3,12 +3,17 @@
 import inspect
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Protocol
 
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 
+#: The name of what :func:`choose_estimator` chooses.
+AUTOMATIC = "auto"
+#: Networks of the learned estimator that come with this package, a file per object.
+SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
 #: Modules that register the estimators of this package. Imported on first use, so that a depth-only estimator
 #: does not pay for the libraries of a learned one.
 _BUILT_IN = {
@@ -45,25 +50,32 @@ def register_estimator(name: str) -> Callable:
 
 
 def list_estimators() -> list[str]:
-    """Names that :func:`create_estimator` knows."""
+    """Names that :func:`create_estimator` knows beside ``auto``."""
     return sorted(_BUILT_IN.keys() | _factories.keys())
+
+
+def choose_estimator(object_name: str) -> str:
+    """What ``auto`` stands for: the learned estimator where weights ship for the object, else the training-free one."""
+    return "dense" if (SHIPPED_WEIGHTS / f"{object_name}.safetensors").is_file() else "geometric"
 
 
 def create_estimator(name: str, model: ObjectModel, **parameters) -> Estimator:
     """Make an estimator for one object.
 
     Args:
-        name: one of :func:`list_estimators`.
+        name: one of :func:`list_estimators`, or ``auto`` for :func:`choose_estimator`'s choice.
         model: the object that it looks for.
         **parameters: keyword arguments of the estimator's factory.
 
     Raises:
         ValueError: unknown name, unknown parameter or bad value; the message names it and what is known.
     """
+    if name == AUTOMATIC:
+        name = choose_estimator(model.name)
     if name not in _factories and name in _BUILT_IN:
         import_module(_BUILT_IN[name])
     if name not in _factories:
-        raise ValueError(f"unknown estimator '{name}'; known: {', '.join(list_estimators())}")
+        raise ValueError(f"unknown estimator '{name}'; known: {', '.join([AUTOMATIC, *list_estimators()])}")
     factory = _factories[name]
     known = list(inspect.signature(factory).parameters)[1:]
     unknown = sorted(parameters.keys() - set(known))

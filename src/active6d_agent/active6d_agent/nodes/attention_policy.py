@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 
-from active6d_agent.policy import Decision, Observation, create_policy, list_policies
+from active6d_agent.policy import AUTOMATIC, Decision, Observation, choose_policy, create_policy, list_policies
 from active6d_core.conversions import (
     MessageError,
     attention_to_cloud,
@@ -44,7 +44,13 @@ class AttentionPolicyNode(GraphNode):
     def __init__(self, **node_arguments) -> None:
         super().__init__("attention_policy", **node_arguments)
         self.object_name = self.declare("object", "mug", "name of the object that fills the bin")
-        self.policy_name = self.declare("policy", "lowest-score", "which policy chooses views", choices=list_policies())
+        policy = self.declare(
+            "policy",
+            AUTOMATIC,
+            "which policy chooses views; auto: the learned one where weights ship for the object",
+            choices=[AUTOMATIC, *list_policies()],
+        )
+        self.policy_name = choose_policy(self.object_name) if policy == AUTOMATIC else policy
         self.policy_parameters = self.declare("policy_parameters", "{}", "the policy's own parameters, a YAML mapping")
         self.steps = self.declare("steps", 5, "budget of moves T; T moves are T + 1 views", minimum=0, maximum=10_000)
         self.metres = self.declare("metres", 0.0, "budget of metres along the hemisphere, 0 for none", minimum=0.0)

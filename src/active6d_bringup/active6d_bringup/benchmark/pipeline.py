@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from active6d_agent.policy import Observation, Policy, create_policy
+from active6d_agent.policy import Observation, Policy, create_policy, shipped_weights
 from active6d_agent.view_attention import new_network, save_network
-from active6d_agent.weights_file import shipped_weights
 from active6d_bringup.benchmark.graph import PreparedViews, prepare_views
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel

@@ -20,7 +20,7 @@ Banks = Annotated[Path | None, typer.Option("--banks", metavar="DIR", help="Fold
 def bank(
     object_name: ObjectName = "mug",
     split: Annotated[str, typer.Option(help="Which stored scenes: train, val or test.")] = "test",
-    estimator: Annotated[str, typer.Option(help="Who finds poses in one view.")] = "geometric",
+    estimator: Annotated[str, typer.Option(help="Who finds poses in one view.")] = "auto",
     scenes: Annotated[int | None, typer.Option(min=1, help="That many of the scenes; all by default.")] = None,
     heaps: Annotated[int, typer.Option(min=0, help="That many more heaps, dropped by seed; for training.")] = 0,
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the sensor's noise.")] = 1.0,
@@ -33,15 +33,17 @@ def bank(
 
     Goes on where it was interrupted. Policies are trained and evaluated on such banks.
 
-    Example: [bold]active6d bank --object mug --split test --estimator dense[/bold]
+    Example: [bold]active6d bank --object mug --split test[/bold]
     """
     from functools import partial
 
     from active6d_agent.bank import bank_path, build_bank, cached_banks, load_bank
     from active6d_core.object_model import load_object
-    from active6d_perception.estimator import create_estimator
+    from active6d_perception.estimator import AUTOMATIC, choose_estimator, create_estimator
 
     names = _scene_names(object_name, split, scenes, heaps)
+    if estimator == AUTOMATIC:
+        estimator = choose_estimator(object_name)
     create_estimator(estimator, load_object(object_name))  # refuses a wrong name or missing weights before any process
     path = bank_path(banks or cached_banks(), object_name, split)
     observe = partial(observe_scene_by_name, estimator=estimator, noise=noise, seed=seed)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def episode(
     object_name: ObjectName = "mug",
     seed: Seed = 0,
-    policy: Annotated[str, typer.Option(help="Who chooses the views.")] = "lowest-score",
+    policy: Annotated[str, typer.Option(help="Who chooses the views.")] = "auto",
     steps: Annotated[int, typer.Option(min=0, help="Budget of moves T; T moves are T + 1 images.")] = 5,
     metres: Annotated[float | None, typer.Option(min=0.0, help="Budget of metres along the hemisphere.")] = None,
     estimator: Annotated[str | None, typer.Option(help="Who finds poses in one view; the params file's.")] = None,
@@ -100,14 +100,14 @@ def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
 
 def _check_names(settings: "EpisodeSettings") -> None:
     """Refuse wrong names before any node starts: a node's process could only say so in its log."""
-    from active6d_agent.policy import list_policies
+    from active6d_agent.policy import AUTOMATIC, list_policies
     from active6d_core.object_model import load_object
     from active6d_perception.estimator import list_estimators
 
     load_object(settings.object)
     for option, value, known in (
-        ("--policy", settings.policy, list_policies()),
-        ("--estimator", settings.estimator, list_estimators()),
+        ("--policy", settings.policy, [AUTOMATIC, *list_policies()]),
+        ("--estimator", settings.estimator, [AUTOMATIC, *list_estimators()]),
     ):
         if value is not None and value not in known:
             raise ValueError(f"{option} '{value}' is not among {', '.join(known)}")

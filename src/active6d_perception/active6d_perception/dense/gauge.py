@@ -18,10 +18,12 @@ from scipy.spatial.transform import Rotation
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, make_transform
 
+#: Turns about the axis, radians, at which the distribution of a turn is evaluated.
+TURNS = np.linspace(0, 2 * np.pi, 72, endpoint=False)
 # Turned about the axis, this share of a near-symmetric body's samples must lie within the tolerance of its surface.
 _BODY_SHARE = 0.9
 _BODY_TOLERANCE = 0.025  # diameters
-_TURNS = np.radians([60.0, 120.0, 180.0, 240.0, 300.0])
+_BODY_TURNS = np.radians([60.0, 120.0, 180.0, 240.0, 300.0])
 # In general position, so that no rotation of a usual finite group leaves an eye's product with it unchanged.
 _REFERENCE = np.array([0.2672612, 0.5345225, 0.8017837])
 
@@ -111,7 +113,7 @@ def _axis_frame_beside(model: ObjectModel, feature: str) -> np.ndarray | None:
         in_plane = np.eye(3) - np.outer(axis, axis)
 
         def distances(offset: np.ndarray, axis: np.ndarray = axis, in_plane: np.ndarray = in_plane) -> np.ndarray:
-            turns = Rotation.from_rotvec(_TURNS[:, None] * axis).as_matrix()
+            turns = Rotation.from_rotvec(_BODY_TURNS[:, None] * axis).as_matrix()
             centre = in_plane @ offset
             return tree.query((body - centre) @ np.swapaxes(turns, 1, 2) + centre)[0]
 

@@ -13,8 +13,8 @@ from active6d_core.se3 import is_rigid
 from active6d_perception.dense.gauge import Gauge, Turn
 from active6d_perception.dense.network import HEADS, DenseNetwork, NetworkSize
 from active6d_perception.dense.network_input import CHANNELS
+from active6d_perception.estimator import SHIPPED_WEIGHTS
 
-SHIPPED_WEIGHTS = Path(__file__).parent.parent / "weights"
 _FORMAT = 1
 
 

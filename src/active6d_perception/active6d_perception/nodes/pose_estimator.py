@@ -22,7 +22,7 @@ from active6d_core.conversions import (
 )
 from active6d_core.node import GraphNode, StampSynchronizer, run_node
 from active6d_core.object_model import load_object
-from active6d_perception.estimator import Estimator, create_estimator, list_estimators
+from active6d_perception.estimator import AUTOMATIC, Estimator, create_estimator, list_estimators
 
 
 class PoseEstimatorNode(GraphNode):
@@ -34,7 +34,12 @@ class PoseEstimatorNode(GraphNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("pose_estimator", **options)
         self._object = self.declare("object", "mug", "name of the object to look for")
-        self._name = self.declare("estimator", "geometric", "which estimator runs", choices=list_estimators())
+        self._name = self.declare(
+            "estimator",
+            AUTOMATIC,
+            "which estimator runs; auto: the learned one where weights ship for the object",
+            choices=[AUTOMATIC, *list_estimators()],
+        )
         self._settings = self.declare(
             "estimator_parameters", "{}", "the estimator's own parameters, a YAML mapping such as {min_score: 0.4}"
         )
