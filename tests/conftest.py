@@ -11,6 +11,8 @@ SOURCES = sorted(str(path) for path in (TESTS.parent / "src").glob("active6d_*")
 sys.path[:0] = [str(TESTS), *(path for path in SOURCES if path not in sys.path)]
 # Child processes (nodes under `--processes`, the command) import the same sources.
 os.environ["PYTHONPATH"] = os.pathsep.join([str(TESTS), *SOURCES, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+# Several threads that share busy cores wait for each other most of the time.
+os.environ["OMP_NUM_THREADS"] = "1"
 # Must be set before the first rclpy import.
 os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
