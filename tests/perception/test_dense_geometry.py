@@ -3,16 +3,20 @@
 import time
 
 import numpy as np
+import open3d as o3d
 import pytest
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.special import softmax
 
-from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View, backproject, pixel_rays
+from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View, backproject, normals_from_points, pixel_rays
 from active6d_core.object_model import load_object
-from active6d_core.se3 import invert, make_transform, rotation_angle, transform_points
-from active6d_perception.dense.gauge import Turn, gauge_of, turn_about_z
+from active6d_core.se3 import invert, look_at, make_transform, rotation_angle, transform_points
+from active6d_perception.dense.estimator import likely_turns
+from active6d_perception.dense.gauge import TURNS, Turn, gauge_of, turn_about_z
 from active6d_perception.dense.network import DIRECTION_BINS, HEADS, DenseNetwork, NetworkSize, fused, split
 from active6d_perception.dense.network_input import (
     CHANNELS,
@@ -25,7 +29,7 @@ from active6d_perception.dense.network_input import (
 )
 from active6d_perception.dense.rigid_fit import kabsch, robust_fit
 from active6d_perception.dense.sphere_bins import CENTRES, density, kernel
-from active6d_perception.dense.turns import turn_evidence
+from active6d_perception.dense.turns import TurnSearch
 from active6d_perception.dense.votes import cluster_votes
 
 OBJECTS = {"coffee_cup": Turn.INVISIBLE, "mug": Turn.TOLD_BY_FEATURE, "bunny": Turn.VISIBLE}
@@ -236,20 +240,80 @@ def test_votes_that_agree_on_nothing_cost_little():
     assert time.process_time() - started < 5
 
 
-def test_the_part_cannot_be_where_the_camera_looked_through():
-    camera = PinholeCamera.from_field_of_view(160, 120, 60.0)
-    part = np.array([[0.04, 0.0, 0.0], [0.05, 0.0, 0.0]])
-    pose = make_transform(np.eye(3), [0, 0, 0.8])
-    turned = pose @ turn_about_z(np.radians([0.0, 90.0, 180.0]))
-    depth = np.full((120, 160), 0.8, np.float32)
-    points = transform_points(turned, part)
-    u = np.rint(points[..., 0] / points[..., 2] * camera.fx + camera.cx).astype(int)
-    v = np.rint(points[..., 1] / points[..., 2] * camera.fy + camera.cy).astype(int)
-    depth[v[1], u[1]] = 1.2  # seen through at the second turn
-    depth[v[2], u[2]] = 0.5  # hidden at the third
-    measured, through, hidden = turn_evidence(turned[None], part, depth, camera)[0]
-    assert measured > hidden > through
-    assert hidden == 0
+def mug_alone(T_camera_mug, camera=PinholeCamera.from_field_of_view(320, 240, 60.0), wall=None):
+    """Ray-cast depth (NaN where nothing is) of a mug alone before nothing; also beside or behind another mesh."""
+    scene = o3d.t.geometry.RaycastingScene()
+    placed = [(load_object("mug").mesh, T_camera_mug)] + ([(wall, np.eye(4))] if wall is not None else [])
+    for mesh, T in placed:
+        scene.add_triangles(transform_points(T, np.asarray(mesh.vertices)).astype(np.float32), np.uint32(mesh.faces))
+    rays = np.concatenate([np.zeros((240, 320, 3), np.float32), pixel_rays(camera)], axis=-1)
+    hit = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+    return np.where(np.isfinite(hit), hit, np.nan).astype(np.float32), camera
+
+
+def turn_likelihood(T_camera_axis, depth, camera, owner=None):
+    model = load_object("mug")
+    normals = normals_from_points(backproject(depth, camera), reach=1)
+    owner = np.where(np.isfinite(depth), 0, -1) if owner is None else owner
+    return TurnSearch(model, gauge_of(model)).log_likelihood(T_camera_axis[None], depth, normals, owner, camera)[0]
+
+
+def upright_mug(azimuth, elevation=35.0):
+    """Pose of a mug's axis frame at 0.8 m whose handle points ``azimuth`` degrees away from the camera's side."""
+    a, e = np.radians([azimuth, elevation])
+    eye = 0.8 * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+    return invert(look_at(eye, np.zeros(3)))
+
+
+@pytest.mark.parametrize("azimuth", [0, 50, 90, 135, -60, -110])
+def test_turn_search_finds_a_visible_handle(azimuth):
+    gauge = gauge_of(load_object("mug"))
+    T_camera_axis = upright_mug(azimuth)
+    depth, camera = mug_alone(gauge.object_pose(T_camera_axis[None])[0])
+    # The search is told the pose with its turn forgotten.
+    forgotten = np.random.default_rng(azimuth % 7).uniform(0, 2 * np.pi)
+    found = turn_likelihood(T_camera_axis @ turn_about_z(forgotten), depth, camera)
+    error = (TURNS[found.argmax()] + forgotten + np.pi) % (2 * np.pi) - np.pi
+    assert np.degrees(abs(error)) < 10
+    turns, certainty = likely_turns(softmax(found)[None], 1)
+    assert turns[0, 0] == found.argmax()
+    assert certainty[0, 0] > 0.99
+
+
+def test_turn_search_tells_that_a_handle_is_hidden():
+    gauge = gauge_of(load_object("mug"))
+    T_camera_axis = upright_mug(180, elevation=5.0)
+    depth, camera = mug_alone(gauge.object_pose(T_camera_axis[None])[0])
+    probability = softmax(turn_likelihood(T_camera_axis, depth, camera))
+    # It is behind the mug, and where behind is anybody's guess.
+    behind = np.abs((TURNS + np.pi) % (2 * np.pi) - np.pi) < np.radians(50)
+    assert probability[behind].sum() > 0.9
+    assert probability.max() < 0.25
+
+
+def test_a_handle_may_be_behind_what_hides_it_and_not_where_the_camera_looked_through():
+    gauge = gauge_of(load_object("mug"))
+    T_camera_axis = upright_mug(90)
+    box = trimesh.creation.box((0.05, 0.2, 0.01))
+    uncovered, camera = mug_alone(gauge.object_pose(T_camera_axis[None])[0])
+    x = (T_camera_axis @ [0.06, 0, 0, 1])[0]
+    box.apply_translation([np.sign(x) * 0.07 * 0.6 / 0.8, 0, 0.6])
+    covered, _ = mug_alone(gauge.object_pose(T_camera_axis[None])[0], wall=box)
+    owner = np.where(np.abs(covered - uncovered) < 1e-4, 0, -1)
+    probability = softmax(turn_likelihood(T_camera_axis, covered, camera, owner))
+    _, certainty = likely_turns(probability[None], 1)
+    true_side = np.abs((TURNS + np.pi) % (2 * np.pi) - np.pi) < np.radians(40)
+    other_side = np.abs(TURNS - np.pi) < np.radians(40)
+    assert certainty[0, 0] < 0.8
+    assert probability[true_side].sum() > 100 * probability[other_side].sum()
+
+
+def test_likely_turns_lie_apart():
+    probability = np.exp(-(np.minimum(TURNS, 2 * np.pi - TURNS) ** 2) * 20)
+    probability += 0.5 * np.roll(probability, 30)
+    turns, certainty = likely_turns((probability / probability.sum())[None], 2)
+    assert turns.tolist() == [[0, 30]]
+    assert np.allclose(certainty, [[2 / 3, 1 / 3]], atol=0.02)
 
 
 def test_backprojection_of_the_output_camera_hits_the_same_points():

@@ -7,15 +7,12 @@ from scipy.special import expit, log_softmax, softmax
 
 from active6d_core.camera import PinholeCamera, pixel_rays
 from active6d_core.se3 import make_transform
-from active6d_perception.dense.gauge import Gauge, Turn, facing_camera, turn_about_z
+from active6d_perception.dense.gauge import TURNS, Gauge, Turn, facing_camera, turn_about_z
 from active6d_perception.dense.network import split
 from active6d_perception.dense.network_input import ray_frames, ray_rotation
 from active6d_perception.dense.rigid_fit import robust_fit
 from active6d_perception.dense.sphere_bins import density
 from active6d_perception.dense.votes import cluster_votes
-
-#: Turns about the axis at which the distribution of a turn is evaluated.
-TURNS = np.linspace(0, 2 * np.pi, 72, endpoint=False)
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,7 @@ class Instances:
         T_camera_axis: (n, 4, 4) pose of the axis frame, at turn 0 where the turn is not told by coordinates.
         agreement: (n,) share of the correspondences that agree with the pose, in [0, 1].
         confidence: (n,) mean probability of the instance's pixels.
-        turn: (n, len(TURNS)) how likely each turn about the axis is, on top of ``T_camera_axis``; rows sum to 1.
+        direction: (n, DIRECTION_BINS) distribution of the axis frame's x, in the frame of the ray through its origin.
     """
 
     pixel: np.ndarray
@@ -55,7 +52,7 @@ class Instances:
     T_camera_axis: np.ndarray
     agreement: np.ndarray
     confidence: np.ndarray
-    turn: np.ndarray
+    direction: np.ndarray
 
     def __len__(self) -> int:
         return len(self.T_camera_axis)
@@ -92,11 +89,11 @@ def decode(
     count = len(clusters.centre)
     table, used = _member_table(label, count, parameters.pixels)
     R_camera_ray = ray_rotation(clusters.centre)
-    directions = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
+    direction = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
     T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
     agreement = np.ones(count)
     if gauge.turn is Turn.VISIBLE:
-        T = T @ turn_about_z(TURNS[_turn_probability(T, R_camera_ray, directions).argmax(axis=1)])
+        T = T @ turn_about_z(TURNS[turn_probability(T, direction).argmax(axis=1)])
     else:
         T = facing_camera(T)
     if count and parameters.coordinates:
@@ -109,18 +106,22 @@ def decode(
             np.random.default_rng(0),
             T[:, None],
         )
-    turn = np.zeros((count, len(TURNS)))
-    turn[:, 0] = 1.0
-    if gauge.turn is Turn.TOLD_BY_FEATURE:
-        turn = _turn_probability(T, R_camera_ray, directions)
     confidence = _mean(probability.ravel()[pixel][:, None], label, count)[:, 0]
-    return Instances(pixel, label, T, agreement, confidence, turn)
+    return Instances(pixel, label, T, agreement, confidence, direction)
 
 
-def _turn_probability(T_camera_axis: np.ndarray, R_camera_ray: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(n, len(TURNS)) probability of each turn, from (n, DIRECTION_BINS) distributions of the frame's x direction."""
-    x = (T_camera_axis[:, None] @ turn_about_z(TURNS))[..., :3, 0]
-    return density(directions, np.einsum("nij,nti->ntj", R_camera_ray, x))
+def turn_probability(T_camera_axis: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """How likely each turn about the axis is by the network alone.
+
+    Args:
+        T_camera_axis: (n, 4, 4) poses; their own turn is turn 0.
+        direction: (n, DIRECTION_BINS) as :attr:`Instances.direction`.
+
+    Returns:
+        (n, len(TURNS)), each row summing to 1.
+    """
+    x = (T_camera_axis[:, None, :3, :3] @ turn_about_z(TURNS)[:, :3, :3])[..., 0]
+    return density(direction, np.einsum("nij,nti->ntj", ray_rotation(T_camera_axis[:, :3, 3]), x))
 
 
 def _poses_from_axes(

@@ -8,12 +8,13 @@ from time import perf_counter
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from scipy.special import softmax
 
-from active6d_core.camera import View, backproject, normals_from_points
+from active6d_core.camera import PinholeCamera, View, backproject, normals_from_points
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
-from active6d_perception.dense.decoding import TURNS, DecodingParameters, Instances, decode
-from active6d_perception.dense.gauge import Turn, turn_about_z
+from active6d_perception.dense.decoding import DecodingParameters, Instances, decode, turn_probability
+from active6d_perception.dense.gauge import TURNS, Turn, turn_about_z
 from active6d_perception.dense.network import fused, has_fast_bfloat16
 from active6d_perception.dense.network_input import (
     OUTPUT_STRIDE,
@@ -25,15 +26,20 @@ from active6d_perception.dense.network_input import (
     reduce_view,
     reduction,
 )
-from active6d_perception.dense.turns import feature_samples, turn_evidence
-from active6d_perception.dense.weights_file import TrainedNetwork, load_network, weights_path
-from active6d_perception.estimator import register_estimator
+from active6d_perception.dense.turns import TurnSearch
+from active6d_perception.dense.weights_file import TrainedNetwork, load_network
+from active6d_perception.estimator import register_estimator, weights_path
 from active6d_perception.model_views import model_views
 from active6d_perception.refinement import claim_pixels, refine, suppress, weigh_evidence
 from active6d_perception.symmetric_distance import SymmetricDistance
 
 # Turns this close to the chosen one count as the same answer when its certainty is told.
 _SAME_TURN = np.radians(30.0)
+# A further turn of an instance is reported only if it is at least this likely.
+_LEAST_CERTAINTY = 0.2
+# Exponent of what the network says about the turn, beside what the depth image says.
+_NETWORK_TRUST = 0.5
+_GATES = (0.008, 0.004)  # metres, of refinement
 # Share of an object's visible surface below which the unhidden part of it proves little.
 _SLIVER = 0.1
 
@@ -85,6 +91,66 @@ class Poses:
         return Poses(self.T_camera_object[index], self.score[index], self.instance[index], self.certainty[index])
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredSurface:
+    """What a view measured, at the network's input resolution.
+
+    Attributes:
+        depth: (h, w) metres, NaN invalid.
+        points: (h, w, 3) in the optical frame.
+        normals: (h, w, 3) facing the camera, NaN unknown.
+        owner: (h, w) index of the pixel's instance, -1 where there is none or no depth.
+        camera: intrinsics.
+        tree: search tree over the points of instances that have normals; None if they are too few.
+        tree_normals: (p, 3) of the tree's points.
+    """
+
+    depth: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    owner: np.ndarray
+    camera: PinholeCamera
+    tree: cKDTree | None
+    tree_normals: np.ndarray
+
+    @classmethod
+    def of(cls, view: ReducedView, instances: Instances) -> "MeasuredSurface":
+        """The surface that a view shows, with the instances that were found in it."""
+        # The reduced depth is a mean of pixels already; smoothing it more rounds edges off and lets poses slide.
+        points = backproject(view.depth, view.camera)
+        normals = normals_from_points(points, reach=1)
+        height, width = view.depth.shape
+        coarse = np.full((height // OUTPUT_STRIDE, width // OUTPUT_STRIDE), -1)
+        coarse.ravel()[instances.pixel] = instances.label
+        enlarged = coarse.repeat(OUTPUT_STRIDE, axis=0).repeat(OUTPUT_STRIDE, axis=1)
+        owner = np.full((height, width), -1)
+        owner[: enlarged.shape[0], : enlarged.shape[1]] = enlarged
+        owner[np.isnan(view.depth)] = -1
+        usable = (owner >= 0) & np.isfinite(normals).all(axis=-1)
+        tree = cKDTree(points[usable]) if np.count_nonzero(usable) > 6 else None
+        return cls(view.depth, points, normals, owner, view.camera, tree, normals[usable])
+
+
+def likely_turns(probability: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The most likely turns of each instance, none near another.
+
+    Args:
+        probability: (n, len(TURNS)) rows that sum to 1.
+        count: turns per instance.
+
+    Returns:
+        (n, count) indices into :data:`TURNS`, and (n, count) the probability of all turns within 30 degrees of each.
+    """
+    chosen, certainty = [], []
+    for _ in range(count):
+        best = probability.argmax(axis=1)
+        near = np.abs((TURNS - TURNS[best][:, None] + np.pi) % (2 * np.pi) - np.pi) < _SAME_TURN
+        chosen.append(best)
+        certainty.append((probability * near).sum(axis=1))
+        probability = np.where(near, 0.0, probability)
+    return np.stack(chosen, axis=1), np.stack(certainty, axis=1)
+
+
 class DenseEstimator:
     """Network, instances from votes, robust rigid fits, visible-surface ICP, judgement by the depth image.
 
@@ -101,9 +167,8 @@ class DenseEstimator:
         self._network = fused(trained.network).to(dtype=self._precision, memory_format=torch.channels_last)
         self._views = model_views(model)
         self._distance = SymmetricDistance(model)
-        samples = model.surface[0]
-        masks = [model.feature_mask(feature, samples) for feature in model.features]
-        self._part = feature_samples(samples, np.any(masks, axis=0)) if masks else np.zeros((0, 3))
+        told_by_feature = trained.gauge.turn is Turn.TOLD_BY_FEATURE
+        self._turns = TurnSearch(model, trained.gauge) if told_by_feature else None
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimator.Estimator.estimate`."""
@@ -145,8 +210,9 @@ class DenseEstimator:
             return Poses(np.zeros((0, 4, 4)), nothing, nothing.astype(int), nothing), np.zeros(
                 view.depth.shape, np.uint16
             )
-        poses = self._timed("turns", self._choose_turns, instances, view)
-        return self._timed("refinement", self._refine_and_judge, poses, instances, view)
+        surface = self._timed("surface", MeasuredSurface.of, view, instances)
+        poses = self._timed("poses", self._find_poses, instances, surface)
+        return self._timed("judging", self._judge, poses, surface)
 
     def ask(self, view: ReducedView) -> np.ndarray:
         """(channels, h, w) answer of the network."""
@@ -157,51 +223,46 @@ class DenseEstimator:
         height, width = (size // OUTPUT_STRIDE for size in view.depth.shape)
         return answer[:, :height, :width].contiguous().numpy()
 
-    def _choose_turns(self, instances: Instances, view: ReducedView) -> Poses:
-        """The most likely turn of each instance, and further ones where they are wanted and possible."""
-        gauge = self._trained.gauge
-        count = len(instances)
+    def _find_poses(self, instances: Instances, surface: MeasuredSurface) -> Poses:
+        """Refined poses, the most likely turn of each instance first."""
+        gauge, count = self._trained.gauge, len(instances)
         score = instances.agreement * instances.confidence
-        if gauge.turn is not Turn.TOLD_BY_FEATURE:
-            return Poses(gauge.object_pose(instances.T_camera_axis), score, np.arange(count), np.ones(count))
-        turned = instances.T_camera_axis[:, None] @ turn_about_z(TURNS)
-        T_camera_object = gauge.object_pose(turned)
-        evidence = turn_evidence(T_camera_object, self._part, view.depth, view.camera)
-        likelihood = instances.turn * np.exp(evidence - evidence.max(axis=1, keepdims=True))
-        likelihood /= np.maximum(likelihood.sum(axis=1, keepdims=True), 1e-12)
-        chosen, certainty = [], []
-        for _ in range(self.parameters.alternatives):
-            best = likelihood.argmax(axis=1)
-            near = np.abs((TURNS - TURNS[best][:, None] + np.pi) % (2 * np.pi) - np.pi) < _SAME_TURN
-            chosen.append(best)
-            certainty.append((likelihood * near).sum(axis=1))
-            likelihood = np.where(near, 0.0, likelihood)
-        certainty = np.concatenate(certainty)
-        instance = np.tile(np.arange(count), self.parameters.alternatives)
-        poses = Poses(T_camera_object[instance, np.concatenate(chosen)], score[instance], instance, certainty)
-        return poses.take(np.flatnonzero((np.arange(len(certainty)) < count) | (certainty > 0.2)))
+        T = instances.T_camera_axis
+        if self._turns is None:
+            T = self._refined(gauge.object_pose(T), surface, _GATES)
+            return Poses(T, score, np.arange(count), np.ones(count))
+        # A first guess of the turn serves to put the axis right, and that to find the turn.
+        probability = self._turn_probability(T, instances, surface)
+        T = T @ turn_about_z(TURNS[probability.argmax(axis=1)])
+        T = self._refined(gauge.object_pose(T), surface, _GATES[:1]) @ gauge.T_object_axis
+        probability = self._turn_probability(T, instances, surface)
+        chosen, certainty = likely_turns(probability, self.parameters.alternatives)
+        instance, rank = np.nonzero((np.arange(chosen.shape[1]) == 0) | (certainty > _LEAST_CERTAINTY))
+        turned = T[instance] @ turn_about_z(TURNS[chosen[instance, rank]])
+        T = self._refined(gauge.object_pose(turned), surface, _GATES[1:])
+        return Poses(T, score[instance], instance, certainty[instance, rank])
 
-    def _refine_and_judge(self, poses: Poses, instances: Instances, view: ReducedView) -> tuple[Poses, np.ndarray]:
-        # The reduced depth is a mean of pixels already; smoothing it more rounds edges off and lets poses slide.
-        depth = view.depth
-        points = backproject(depth, view.camera)
-        normals = normals_from_points(points, reach=1)
+    def _turn_probability(self, T: np.ndarray, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
+        """(n, len(TURNS)) by network and depth together."""
+        measured = self._turns.log_likelihood(T, surface.depth, surface.normals, surface.owner, surface.camera)
+        told = _NETWORK_TRUST * np.log(turn_probability(T, instances.direction) + 1e-6)
+        return softmax(measured + told, axis=1)
+
+    def _refined(self, T: np.ndarray, surface: MeasuredSurface, gates: tuple[float, ...]) -> np.ndarray:
+        if not self.parameters.refined or surface.tree is None:
+            return T
+        return refine(self._views, T, surface.tree, surface.tree_normals, gates=gates)
+
+    def _judge(self, poses: Poses, surface: MeasuredSurface) -> tuple[Poses, np.ndarray]:
         T = poses.T_camera_object
-        candidates = self._object_pixels(instances, view) & np.isfinite(depth)
-        usable = candidates & np.isfinite(normals).all(axis=-1)
-        if self.parameters.refined and usable.sum() > 6:
-            T = refine(self._views, T, cKDTree(points[usable]), normals[usable])
-        evidence = weigh_evidence(self._views, T, depth, normals, view.camera)
+        evidence = weigh_evidence(self._views, T, surface.depth, surface.normals, surface.camera)
         # Of the surface that nothing hides, how much is measured where it should be; a sliver is weak evidence.
         fit = np.clip(evidence.fitting - evidence.violated, 0.0, 1.0) / np.maximum(1.0 - evidence.occluded, _SLIVER)
         # An instance is there whichever way it is turned, so an unknown turn halves the score at most.
         score = np.sqrt(fit * poses.score) * 0.5 * (1.0 + poses.certainty)
-        judged = Poses(T, score, poses.instance, poses.certainty)
-        return self._report(judged, points, candidates, view)
+        return self._report(Poses(T, score, poses.instance, poses.certainty), surface)
 
-    def _report(
-        self, poses: Poses, points: np.ndarray, candidates: np.ndarray, view: ReducedView
-    ) -> tuple[Poses, np.ndarray]:
+    def _report(self, poses: Poses, surface: MeasuredSurface) -> tuple[Poses, np.ndarray]:
         """Without duplicates and without poses that score too little or explain no pixels; instances renumbered."""
         distance = self._distance.between(poses.T_camera_object, poses.T_camera_object)
         # Alternatives of one instance are no duplicates unless refinement made them the same.
@@ -212,7 +273,14 @@ class DenseEstimator:
         poses = poses.take(kept[poses.score[kept] >= self.parameters.min_score])
         _, first = np.unique(poses.instance, return_index=True)
         first = np.sort(first)
-        label = claim_pixels(self._views, poses.T_camera_object[first], points, candidates, view.camera, min_pixels=8)
+        label = claim_pixels(
+            self._views,
+            poses.T_camera_object[first],
+            surface.points,
+            surface.owner >= 0,
+            surface.camera,
+            min_pixels=8,
+        )
         seen = np.unique(label[label > 0]).astype(int) - 1
         number = np.full(poses.instance.max(initial=0) + 1, -1)
         number[poses.instance[first[seen]]] = np.arange(len(seen))
@@ -226,17 +294,6 @@ class DenseEstimator:
         """(k, k) distances between the axis frames' origins, metres."""
         origin = (poses.T_camera_object @ self._trained.gauge.T_object_axis)[:, :3, 3]
         return np.linalg.norm(origin[:, None] - origin, axis=-1)
-
-    @staticmethod
-    def _object_pixels(instances: Instances, view: ReducedView) -> np.ndarray:
-        """(h, w) bool at the input's resolution: pixels of any instance."""
-        height, width = view.depth.shape
-        coarse = np.zeros((height // OUTPUT_STRIDE, width // OUTPUT_STRIDE), bool)
-        coarse.ravel()[instances.pixel] = True
-        fine = np.zeros((height, width), bool)
-        enlarged = coarse.repeat(OUTPUT_STRIDE, axis=0).repeat(OUTPUT_STRIDE, axis=1)
-        fine[: enlarged.shape[0], : enlarged.shape[1]] = enlarged
-        return fine
 
     def _timed(self, stage: str, function: Callable, *arguments):
         start = perf_counter()

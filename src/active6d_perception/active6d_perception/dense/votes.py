@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 _VOXEL = 0.06  # diameters
 _BANDWIDTH = 0.07  # diameters, of the mean shift's Gaussian kernel
@@ -66,12 +67,12 @@ def _mean_shift(
 
 
 def _affinity(a: np.ndarray, b: np.ndarray, bandwidth: float) -> np.ndarray:
-    return np.exp(-_square_distances(a, b) / (2 * bandwidth**2))
+    return np.exp(cdist(a, b, "sqeuclidean") * (-0.5 / bandwidth**2))
 
 
 def _separate(modes: np.ndarray, density: np.ndarray, distance: float) -> np.ndarray:
     """Densest modes first, each at least ``distance`` from those before it."""
-    near = _square_distances(modes, modes) < distance**2
+    near = cdist(modes, modes, "sqeuclidean") < distance**2
     free, kept = np.ones(len(modes), bool), []
     for index in np.argsort(-density, kind="stable"):
         if free[index]:
@@ -82,10 +83,6 @@ def _separate(modes: np.ndarray, density: np.ndarray, distance: float) -> np.nda
 
 def _nearest(votes: np.ndarray, centre: np.ndarray, reach: float) -> np.ndarray:
     """(p,) index of the nearest centre, -1 where none is within reach."""
-    square = _square_distances(votes, centre)
+    square = cdist(votes, centre, "sqeuclidean")
     nearest = square.argmin(axis=1)
     return np.where(square[np.arange(len(votes)), nearest] < reach**2, nearest, -1)
-
-
-def _square_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.maximum((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T, 0.0)

@@ -13,7 +13,6 @@ from active6d_core.se3 import is_rigid
 from active6d_perception.dense.gauge import Gauge, Turn
 from active6d_perception.dense.network import HEADS, DenseNetwork, NetworkSize
 from active6d_perception.dense.network_input import CHANNELS
-from active6d_perception.estimator import SHIPPED_WEIGHTS
 
 _FORMAT = 1
 
@@ -36,11 +35,6 @@ class TrainedNetwork:
     diameter: float
     size: NetworkSize
     training: dict = field(default_factory=dict)
-
-
-def weights_path(object_name: str) -> Path:
-    """Where the shipped weights of an object are, or would be."""
-    return SHIPPED_WEIGHTS / f"{object_name}.safetensors"
 
 
 def save_network(path: Path, trained: TrainedNetwork) -> None:
