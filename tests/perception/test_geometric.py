@@ -13,7 +13,13 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception import estimator as estimator_module
-from active6d_perception.estimator import choose_estimator, create_estimator, list_estimators, register_estimator
+from active6d_perception.estimator import (
+    choose_estimator,
+    create_estimator,
+    list_estimators,
+    register_estimator,
+    weights_path,
+)
 from active6d_perception.evaluation import LabelledView, detection_over_views, evaluate_estimator
 from active6d_perception.refinement import suppress
 from active6d_sim.heap import drop_heap
@@ -120,10 +126,17 @@ def test_suppression_keeps_the_best_of_neighbours():
     np.testing.assert_array_equal(kept, [1, 3, 4])
 
 
-def test_auto_is_the_learned_estimator_where_its_weights_ship(tmp_path, monkeypatch):
+def test_auto_is_the_learned_estimator_where_there_are_weights(tmp_path, monkeypatch):
     monkeypatch.setattr(estimator_module, "SHIPPED_WEIGHTS", tmp_path)
     assert choose_estimator("mug") == "geometric"
     assert type(create_estimator("auto", load_object("mug"))) is type(create_estimator("geometric", load_object("mug")))
     (tmp_path / "mug.safetensors").touch()
     assert choose_estimator("mug") == "dense"
     assert choose_estimator("bunny") == "geometric"
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "bunny.safetensors").touch()
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", f"{tmp_path}/nowhere:{mine}")
+    assert choose_estimator("bunny") == "dense"
+    assert weights_path("bunny") == mine / "bunny.safetensors"
+    assert weights_path("mug") == tmp_path / "mug.safetensors"

@@ -85,7 +85,7 @@ class ObjectModel:
 
 def list_objects() -> list[str]:
     """Names of all objects that :func:`load_object` finds."""
-    return sorted({path.stem for folder in _search_folders() for path in folder.glob("*.yaml")})
+    return sorted({path.stem for folder in search_folders() for path in folder.glob("*.yaml")})
 
 
 @lru_cache(maxsize=16)
@@ -95,7 +95,7 @@ def load_object(name: str) -> ObjectModel:
     Raises:
         ValueError: no such object, or its description is wrong; the message names the file and the key.
     """
-    for folder in _search_folders():
+    for folder in search_folders():
         path = folder / f"{name}.yaml"
         if path.is_file():
             return read_description(path)
@@ -140,7 +140,8 @@ def read_description(path: Path) -> ObjectModel:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _search_folders() -> list[Path]:
+def search_folders() -> list[Path]:
+    """Where descriptions are looked for, in this order: ``ACTIVE6D_OBJECT_PATH``, then what ships."""
     extra = os.environ.get("ACTIVE6D_OBJECT_PATH", "")
     return [Path(folder) for folder in extra.split(os.pathsep) if folder] + [SHIPPED_OBJECTS]
 

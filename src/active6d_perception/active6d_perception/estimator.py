@@ -8,11 +8,11 @@ from typing import Protocol
 
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
-from active6d_core.object_model import ObjectModel
+from active6d_core.object_model import ObjectModel, search_folders
 
 #: The name of what :func:`choose_estimator` chooses.
 AUTOMATIC = "auto"
-#: Networks of the learned estimator that come with this package, a file per object.
+#: Networks of the learned estimator that come with this package.
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
 #: Modules that register the estimators of this package. Imported on first use, so that a depth-only estimator
 #: does not pay for the libraries of a learned one.
@@ -55,8 +55,14 @@ def list_estimators() -> list[str]:
 
 
 def choose_estimator(object_name: str) -> str:
-    """What ``auto`` stands for: the learned estimator where weights ship for the object, else the training-free one."""
-    return "dense" if (SHIPPED_WEIGHTS / f"{object_name}.safetensors").is_file() else "geometric"
+    """What ``auto`` stands for: the learned estimator if the object has weights, else the training-free one."""
+    return "dense" if weights_path(object_name).is_file() else "geometric"
+
+
+def weights_path(object_name: str) -> Path:
+    """The object's network: beside its description if it is one that was added, else where shipped ones are."""
+    beside = [folder / f"{object_name}.safetensors" for folder in search_folders()]
+    return next((path for path in beside if path.is_file()), SHIPPED_WEIGHTS / f"{object_name}.safetensors")
 
 
 def create_estimator(name: str, model: ObjectModel, **parameters) -> Estimator:

@@ -79,7 +79,7 @@ def _provenance(object_name: str, estimator: str, noise: float, seed: int) -> di
     """What the bank depends on: a bank of other weights is another bank."""
     import hashlib
 
-    from active6d_perception.dense.weights_file import weights_path
+    from active6d_perception.estimator import weights_path
 
     provenance: dict[str, Any] = {"estimator": estimator, "noise": noise, "seed": seed}
     weights = weights_path(object_name)

@@ -76,8 +76,7 @@ def estimator(
     from rich.table import Table
 
     from active6d_bringup.benchmark.estimator import VISIBLE, measure_estimators
-    from active6d_perception.dense.weights_file import weights_path
-    from active6d_perception.estimator import list_estimators
+    from active6d_perception.estimator import list_estimators, weights_path
 
     # The learned one takes part for objects that it has learned.
     able = [name for name in list_estimators() if name != "dense" or weights_path(object_name).is_file()]

@@ -28,7 +28,7 @@ from active6d_perception.dense.network_input import (
 )
 from active6d_perception.dense.turns import TurnSearch
 from active6d_perception.dense.weights_file import TrainedNetwork, load_network
-from active6d_perception.estimator import register_estimator, weights_path
+from active6d_perception.estimator import register_estimator, weights_path, weights_path
 from active6d_perception.model_views import model_views
 from active6d_perception.refinement import claim_pixels, refine, suppress, weigh_evidence
 from active6d_perception.symmetric_distance import SymmetricDistance

@@ -37,7 +37,7 @@ class PoseEstimatorNode(GraphNode):
         self._name = self.declare(
             "estimator",
             AUTOMATIC,
-            "which estimator runs; auto: the learned one where weights ship for the object",
+            "which estimator runs; auto: the learned one if the object has weights",
             choices=[AUTOMATIC, *list_estimators()],
         )
         self._settings = self.declare(
