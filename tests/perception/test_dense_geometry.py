@@ -29,6 +29,7 @@ from active6d_perception.dense.network_input import (
 )
 from active6d_perception.dense.rigid_fit import kabsch, robust_fit
 from active6d_perception.dense.sphere_bins import CENTRES, density, kernel
+from active6d_perception.dense.surface import MeasuredSurface
 from active6d_perception.dense.turns import TurnSearch
 from active6d_perception.dense.votes import cluster_votes
 
@@ -241,21 +242,24 @@ def test_votes_that_agree_on_nothing_cost_little():
 
 
 def mug_alone(T_camera_mug, camera=PinholeCamera.from_field_of_view(320, 240, 60.0), wall=None):
-    """Ray-cast depth (NaN where nothing is) of a mug alone before nothing; also beside or behind another mesh."""
+    """Ray-cast depth of a mug alone before a wall 1.5 m away; also beside or behind another mesh."""
     scene = o3d.t.geometry.RaycastingScene()
     placed = [(load_object("mug").mesh, T_camera_mug)] + ([(wall, np.eye(4))] if wall is not None else [])
     for mesh, T in placed:
         scene.add_triangles(transform_points(T, np.asarray(mesh.vertices)).astype(np.float32), np.uint32(mesh.faces))
     rays = np.concatenate([np.zeros((240, 320, 3), np.float32), pixel_rays(camera)], axis=-1)
     hit = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
-    return np.where(np.isfinite(hit), hit, np.nan).astype(np.float32), camera
+    return np.minimum(hit, 1.5).astype(np.float32), camera
 
 
 def turn_likelihood(T_camera_axis, depth, camera, owner=None):
     model = load_object("mug")
-    normals = normals_from_points(backproject(depth, camera), reach=1)
-    owner = np.where(np.isfinite(depth), 0, -1) if owner is None else owner
-    return TurnSearch(model, gauge_of(model)).log_likelihood(T_camera_axis[None], depth, normals, owner, camera)[0]
+    points = backproject(depth, camera)
+    owner = np.where(depth < 1.5, 0, -1) if owner is None else owner
+    surface = MeasuredSurface(
+        depth, points, normals_from_points(points, reach=1), owner, camera, None, np.zeros((0, 3))
+    )
+    return TurnSearch(model, gauge_of(model)).log_likelihood(T_camera_axis[None], surface)[0]
 
 
 def upright_mug(azimuth, elevation=35.0):

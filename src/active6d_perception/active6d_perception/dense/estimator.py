@@ -7,10 +7,9 @@ from time import perf_counter
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from scipy.special import softmax
 
-from active6d_core.camera import PinholeCamera, View, backproject, normals_from_points
+from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.dense.decoding import DecodingParameters, Instances, decode, turn_probability
@@ -26,9 +25,10 @@ from active6d_perception.dense.network_input import (
     reduce_view,
     reduction,
 )
+from active6d_perception.dense.surface import MeasuredSurface
 from active6d_perception.dense.turns import TurnSearch
 from active6d_perception.dense.weights_file import TrainedNetwork, load_network
-from active6d_perception.estimator import register_estimator, weights_path, weights_path
+from active6d_perception.estimator import register_estimator, weights_path
 from active6d_perception.model_views import model_views
 from active6d_perception.refinement import claim_pixels, refine, suppress, weigh_evidence
 from active6d_perception.symmetric_distance import SymmetricDistance
@@ -38,7 +38,7 @@ _SAME_TURN = np.radians(30.0)
 # A further turn of an instance is reported only if it is at least this likely.
 _LEAST_CERTAINTY = 0.2
 # Exponent of what the network says about the turn, beside what the depth image says.
-_NETWORK_TRUST = 0.5
+_NETWORK_TRUST = 0.6
 _GATES = (0.008, 0.004)  # metres, of refinement
 # Share of an object's visible surface below which the unhidden part of it proves little.
 _SLIVER = 0.1
@@ -89,46 +89,6 @@ class Poses:
     def take(self, index: np.ndarray) -> "Poses":
         """The poses at ``index``, in that order."""
         return Poses(self.T_camera_object[index], self.score[index], self.instance[index], self.certainty[index])
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredSurface:
-    """What a view measured, at the network's input resolution.
-
-    Attributes:
-        depth: (h, w) metres, NaN invalid.
-        points: (h, w, 3) in the optical frame.
-        normals: (h, w, 3) facing the camera, NaN unknown.
-        owner: (h, w) index of the pixel's instance, -1 where there is none or no depth.
-        camera: intrinsics.
-        tree: search tree over the points of instances that have normals; None if they are too few.
-        tree_normals: (p, 3) of the tree's points.
-    """
-
-    depth: np.ndarray
-    points: np.ndarray
-    normals: np.ndarray
-    owner: np.ndarray
-    camera: PinholeCamera
-    tree: cKDTree | None
-    tree_normals: np.ndarray
-
-    @classmethod
-    def of(cls, view: ReducedView, instances: Instances) -> "MeasuredSurface":
-        """The surface that a view shows, with the instances that were found in it."""
-        # The reduced depth is a mean of pixels already; smoothing it more rounds edges off and lets poses slide.
-        points = backproject(view.depth, view.camera)
-        normals = normals_from_points(points, reach=1)
-        height, width = view.depth.shape
-        coarse = np.full((height // OUTPUT_STRIDE, width // OUTPUT_STRIDE), -1)
-        coarse.ravel()[instances.pixel] = instances.label
-        enlarged = coarse.repeat(OUTPUT_STRIDE, axis=0).repeat(OUTPUT_STRIDE, axis=1)
-        owner = np.full((height, width), -1)
-        owner[: enlarged.shape[0], : enlarged.shape[1]] = enlarged
-        owner[np.isnan(view.depth)] = -1
-        usable = (owner >= 0) & np.isfinite(normals).all(axis=-1)
-        tree = cKDTree(points[usable]) if np.count_nonzero(usable) > 6 else None
-        return cls(view.depth, points, normals, owner, view.camera, tree, normals[usable])
 
 
 def likely_turns(probability: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -244,7 +204,7 @@ class DenseEstimator:
 
     def _turn_probability(self, T: np.ndarray, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
         """(n, len(TURNS)) by network and depth together."""
-        measured = self._turns.log_likelihood(T, surface.depth, surface.normals, surface.owner, surface.camera)
+        measured = self._turns.log_likelihood(T, surface)
         told = _NETWORK_TRUST * np.log(turn_probability(T, instances.direction) + 1e-6)
         return softmax(measured + told, axis=1)
 
