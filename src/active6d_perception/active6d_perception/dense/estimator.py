@@ -191,8 +191,8 @@ class DenseEstimator:
         if self._turns is None:
             T = self._refined(gauge.object_pose(T), surface, _GATES)
             return Poses(T, score, np.arange(count), np.ones(count))
-        # A first guess of the turn serves to put the axis right, and that to find the turn.
-        probability = self._turn_probability(T, instances, surface)
+        # The network's guess of the turn serves to put the axis right, and that to find the turn.
+        probability = turn_probability(T, instances.direction)
         T = T @ turn_about_z(TURNS[probability.argmax(axis=1)])
         T = self._refined(gauge.object_pose(T), surface, _GATES[:1]) @ gauge.T_object_axis
         probability = self._turn_probability(T, instances, surface)

@@ -13,7 +13,7 @@ from active6d_perception.dense.gauge import TURNS, Gauge, turn_about_z
 from active6d_perception.dense.surface import MeasuredSurface
 from active6d_perception.model_views import model_views
 
-_SAMPLES = 128
+_SAMPLES = 64
 _EDGES = np.array([-0.012, -0.006, 0.006, 0.012, np.inf], np.float32)  # metres behind the measured surface
 _ALIKE = 0.6  # cosine between normals
 # Log-likelihood ratios of what is found where the part would be seen, between the right turn and wrong ones. Columns:
