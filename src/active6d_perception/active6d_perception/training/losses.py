@@ -24,7 +24,7 @@ class LossWeights:
     scale: float = 0.1
     axis: float = 2.0
     axis_line: float = 2.0
-    direction: float = 0.3
+    direction: float = 1.0
 
 
 def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
