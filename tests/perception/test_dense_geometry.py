@@ -309,7 +309,7 @@ def test_a_handle_may_be_behind_what_hides_it_and_not_where_the_camera_looked_th
     true_side = np.abs((TURNS + np.pi) % (2 * np.pi) - np.pi) < np.radians(40)
     other_side = np.abs(TURNS - np.pi) < np.radians(40)
     assert certainty[0, 0] < 0.8
-    assert probability[true_side].sum() > 100 * probability[other_side].sum()
+    assert probability[true_side].sum() > 30 * probability[other_side].sum()
 
 
 def test_likely_turns_lie_apart():
