@@ -42,16 +42,12 @@ class Instances:
         pixel: (p,) flat indices into the answer's image.
         label: (p,) index of each pixel's instance.
         T_camera_axis: (n, 4, 4) pose of the axis frame, at turn 0 where the turn is not told by coordinates.
-        agreement: (n,) share of the correspondences that agree with the pose, in [0, 1].
-        confidence: (n,) mean probability of the instance's pixels.
         direction: (n, DIRECTION_BINS) distribution of the axis frame's x, in the frame of the ray through its origin.
     """
 
     pixel: np.ndarray
     label: np.ndarray
     T_camera_axis: np.ndarray
-    agreement: np.ndarray
-    confidence: np.ndarray
     direction: np.ndarray
 
     def __len__(self) -> int:
@@ -91,14 +87,13 @@ def decode(
     R_camera_ray = ray_rotation(clusters.centre)
     direction = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
     T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
-    agreement = np.ones(count)
     if gauge.turn is Turn.VISIBLE:
         T = T @ turn_about_z(TURNS[turn_probability(T, direction).argmax(axis=1)])
     else:
         T = facing_camera(T)
     if count and parameters.coordinates:
         trust = used * np.exp(-np.clip(parts["coordinates_scale"][:, 0], -4.0, 0.0))[table]
-        T, agreement = robust_fit(
+        T, _ = robust_fit(
             parts["coordinates"][table].astype(float) * diameter,
             points[table].astype(float),
             trust.astype(float),
@@ -106,8 +101,7 @@ def decode(
             np.random.default_rng(0),
             T[:, None],
         )
-    confidence = _mean(probability.ravel()[pixel][:, None], label, count)[:, 0]
-    return Instances(pixel, label, T, agreement, confidence, direction)
+    return Instances(pixel, label, T, direction)
 
 
 def turn_probability(T_camera_axis: np.ndarray, direction: np.ndarray) -> np.ndarray:
