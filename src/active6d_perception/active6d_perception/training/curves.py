@@ -22,19 +22,25 @@ def draw_curves(history: Sequence[dict[str, float]], path: Path, title: str) -> 
     """
     from matplotlib.figure import Figure  # slow to import, and a training that never validates needs none of it
 
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    rates, losses = figure.subplots(1, 2)
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(3, 4))
+    rates = above.subplots()
     steps = [entry["step"] for entry in history]
     for key, label in _RATES.items():
         rates.plot(steps, [entry[key] for entry in history], marker=".", label=label)
-    rates.set(xlabel="step", ylabel="rate on the validation split", ylim=(0, 1))
+    rates.set(ylabel="rate on the validation split", ylim=(0, 1))
+    rates.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    rates.grid(alpha=0.3)
+    # A panel for each term: their sizes differ by orders of magnitude.
     terms = [key.removeprefix("training_") for key in history[0] if key.startswith("training_")]
-    for color, term in enumerate(terms):
-        losses.plot(steps, [entry[f"training_{term}"] for entry in history], f"C{color}-", label=term)
-        losses.plot(steps, [entry[f"loss_{term}"] for entry in history], f"C{color}--")
-    losses.set(xlabel="step", ylabel="loss (dashed: validation)")
-    for axes in (rates, losses):
+    panels = below.subplots(2, -(-len(terms) // 2)).ravel()
+    for unused in panels[len(terms) :]:
+        unused.remove()
+    for axes, term in zip(panels, terms, strict=False):
+        axes.plot(steps, [entry[f"training_{term}"] for entry in history], marker=".")
+        axes.plot(steps, [entry[f"loss_{term}"] for entry in history], marker=".", linestyle="--")
+        axes.set_title(f"loss: {term}", fontsize="medium")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize="small")
+    below.supxlabel("step (losses: training solid, validation dashed)", fontsize="medium")
     figure.suptitle(title)
     figure.savefig(path, dpi=100)
