@@ -26,11 +26,17 @@ def slab():
     """A verifier whose object is a large plane z = 0 of the object's frame, facing its +z."""
     xy = np.stack(np.meshgrid(*[np.arange(-0.1, 0.1, 0.002)] * 2), axis=-1).reshape(-1, 2)
     points = np.column_stack([xy, np.zeros(len(xy))])
+    tree = cKDTree(points)
+
+    def nearest_visible(q, direction, bound):
+        distance, found = tree.query(q, distance_upper_bound=bound)
+        return distance, np.where(np.isfinite(distance), found, -1)
+
     views = SimpleNamespace(
         points=points,
         normals=np.tile([0.0, 0.0, 1.0], (len(points), 1)),
         spacing=0.0015,
-        visible_tree=lambda direction: (np.arange(len(points)), cKDTree(points)),
+        nearest_visible=nearest_visible,
         nearest_direction=lambda T: np.zeros(len(T), int),
     )
     verifier = Verifier(load_object("mug"), EPSILON)
@@ -70,7 +76,9 @@ def test_the_mean_is_over_all_points_of_the_mask(slab):
 def test_flipped_normals_cancel_the_distance_term(slab):
     points = np.array([[0.01, 0.02, 0.5]])
     for normal, expected in (([0.0, 0.0, -1.0], 1.0), ([0.0, 0.0, 1.0], 0.0), ([0.0, 0.0, 0.0], 0.5)):
-        assert slab.fits(points, np.array([normal]), FACING, 0)[0] == pytest.approx(expected, abs=1e-9)
+        assert slab.fits(points, np.array([normal]), FACING[None], np.zeros(1, int))[0] == pytest.approx(
+            expected, abs=1e-9
+        )
 
 
 def test_local_fit_is_equation_1():
@@ -93,7 +101,7 @@ def test_agrees_with_a_true_rendering(name, render, pose):
         true = pose(seed)
         depth, _ = render(model, true)
         hypotheses = whole_mask(true, depth)
-        pixels = verifier._mask_pixels(depth, hypotheses, 0)
+        pixels, _ = verifier.mask_pixels(depth, hypotheses)
         q, n_q = points_and_normals(depth, DEFAULT_CAMERA, pixels, verifier.reach)
         turn = make_transform(Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix(), rng.normal(0, 0.003, 3))
         for guess in (true, true @ turn):
@@ -104,6 +112,53 @@ def test_agrees_with_a_true_rendering(name, render, pose):
             product = np.einsum("ni,ni->n", model_normals[seen][nearest], n_q)
             expected = local_fit(distance, product, EPSILON).mean()
             assert verifier.score(depth, DEFAULT_CAMERA, moved)[0] == pytest.approx(expected, abs=0.02)
+
+
+def score_one(verifier, depth, hypotheses, index):
+    """Equation 1 of one hypothesis, point by point, every visible sample tried; with the documented disc per sample."""
+    views, epsilon = verifier.views, verifier.epsilon
+    T = hypotheses.T_camera_object[index]
+    inside = np.flatnonzero((hypotheses.segmentation == hypotheses.label[index]) & np.isfinite(depth))
+    if len(inside) > verifier.samples:
+        inside = inside[[i * (len(inside) - 1) // (verifier.samples - 1) for i in range(verifier.samples)]]
+    if not len(inside):
+        return 0.0
+    q, n_q = points_and_normals(depth, DEFAULT_CAMERA, inside, verifier.reach)
+    visible = np.flatnonzero(views.visible[np.argmax(views.directions @ (-T[:3, :3].T @ T[:3, 3]))])
+    p, n_p = views.points[visible] @ T[:3, :3].T + T[:3, 3], views.normals[visible] @ T[:3, :3].T
+    fits = []
+    for point, normal in zip(q, n_q, strict=True):
+        nearest = np.linalg.norm(p - point, axis=1).argmin()
+        offset = point - p[nearest]
+        off_plane = offset @ n_p[nearest]
+        beside = np.linalg.norm(offset - off_plane * n_p[nearest])
+        distance = np.hypot(off_plane, max(beside - views.spacing, 0.0))
+        fits.append(0.5 * (1 - distance / epsilon) + 0.5 * n_p[nearest] @ normal if distance < epsilon else 0.0)
+    return np.mean(fits)
+
+
+@pytest.mark.parametrize("name", ["coffee_cup", "bunny", "mug"])
+def test_all_at_once_is_one_by_one(name, render, pose):
+    """Hypotheses near and far, masks large, small, shared, empty of depth: as if each were verified alone."""
+    model, rng = load_object(name), np.random.default_rng(4)
+    verifier = Verifier(model, EPSILON, samples=64)
+    depth, _ = render(model, pose(0))
+    depth = depth + rng.normal(0.0, 0.001, depth.shape).astype(np.float32)
+    rows, columns = np.nonzero(np.isfinite(depth))
+    mask = np.zeros(depth.shape, np.uint16)
+    mask[rows, columns] = 1 + (columns > np.median(columns))
+    mask[rows[:40], columns[:40]] = 3
+    mask[:5, :5] = 4
+    label = np.array([1, 2, 3, 4, 1, 2, 3, 1, 2])
+    turns = Rotation.from_rotvec(rng.normal(0, 0.2, (len(label), 3))).as_matrix()
+    off = make_transform(turns, rng.normal(0, [0.006], (len(label), 3)))
+    off[-2:, :3, 3] += 0.5
+    hypotheses = Hypotheses.from_masks(pose(0) @ off, np.ones(len(label)), label, mask, depth)
+    scores = verifier.score(depth, DEFAULT_CAMERA, hypotheses)
+    expected = [score_one(verifier, depth, hypotheses, index) for index in range(len(label))]
+    np.testing.assert_allclose(scores, expected, atol=1e-6)
+    assert scores[[3, 7, 8]].tolist() == [0.0, 0.0, 0.0]
+    assert (scores[[0, 1, 4, 5]] > 0.1).all()
 
 
 def test_scene_normals_do_not_reach_across_an_edge():

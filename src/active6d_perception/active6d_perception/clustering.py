@@ -5,8 +5,6 @@ functions, so that they cannot disagree.
 """
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 
 def cluster_groups(distance: np.ndarray, valid: np.ndarray, cut: float) -> np.ndarray:
@@ -57,12 +55,22 @@ def cluster(distance: np.ndarray, cut: float) -> np.ndarray:
     count = len(distance)
     labels = np.arange(count)
     # No mean over distances above the cut is below it, so clusters lie within components of the near pairs.
-    _, component = connected_components(csr_array(distance <= cut), directed=False)
-    members, valid = group(component)
+    members, valid = group(_components(distance <= cut))
     blocks = distance[members[:, :, None], members[:, None, :]]
     local = cluster_groups(blocks, valid, cut)
     labels[members[valid]] = np.take_along_axis(members, local, axis=1)[valid]
     return labels
+
+
+def _components(near: np.ndarray) -> np.ndarray:
+    """(k,) first item of each item's connected component; for tens of items this beats building a sparse graph."""
+    component = near.argmax(axis=1)
+    while True:
+        lowest = np.where(near, component, len(near)).min(axis=1, initial=len(near))
+        lowest = lowest[lowest]
+        if (lowest == component).all():
+            return component
+        component = lowest
 
 
 def group(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

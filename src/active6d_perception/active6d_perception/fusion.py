@@ -170,12 +170,16 @@ class SceneFusion:
         if stamp in self._stamps:
             return False
         T = T_world_camera @ hypotheses.T_camera_object
-        known, own = self._distance.between(T, self._T_world_object), self._distance.between(T, T)
-        self._distances = np.block([[self._distances, known.T], [known, own]])
+        known = len(self._T_world_object)
+        self._T_world_object = np.concatenate([self._T_world_object, T])
+        distances = np.empty((len(self._T_world_object),) * 2)
+        distances[:known, :known] = self._distances
+        distances[known:] = self._distance.between(T, self._T_world_object)
+        distances[:known, known:] = distances[known:, :known].T
+        self._distances = distances
         row = np.column_stack([verification, hypotheses.score, hypotheses.box, hypotheses.depth])
         self._stamps.add(stamp)
         self._stamp = np.append(self._stamp, np.full(len(T), stamp))
-        self._T_world_object = np.concatenate([self._T_world_object, T])
         self._table = np.concatenate([self._table, row])
         return True
 

@@ -72,6 +72,30 @@ class ModelViews:
             self._trees[direction] = index, cKDTree(self.points[index])
         return self._trees[direction]
 
+    def nearest_visible(self, points: np.ndarray, direction: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
+        """The sample nearest to each point among those visible from the point's direction.
+
+        Args:
+            points: (n, 3) in the object frame, metres.
+            direction: (n,) indices of view directions.
+            bound: metres.
+
+        Returns:
+            (n,) distances and (n,) indices of the samples; ``inf`` and -1 where none is within ``bound``.
+        """
+        samples, tree = self._visible_forest
+        distance, found = tree.query(np.column_stack([points, direction]), distance_upper_bound=bound)
+        return distance, samples[found]
+
+    @cached_property
+    def _visible_forest(self) -> tuple[np.ndarray, cKDTree]:
+        """All directions' visible samples, and -1, and one tree of them: the direction is a fourth coordinate, in which
+        neighbours are a metre apart, so that one search serves points of many directions."""
+        direction, sample = np.nonzero(self.visible)
+        tree = cKDTree(np.column_stack([self.points[sample], direction]), 24, compact_nodes=False, balanced_tree=False)
+        # Where nothing is in reach the tree answers with its own size.
+        return np.append(sample, -1), tree
+
     def visible_subset(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """At most ``count`` visible samples a direction, evenly taken: (m, count) indices, (m, count) bool used."""
         if count not in self._subsets:

@@ -48,8 +48,7 @@ class Verifier:
                 raise ValueError(f"verification: {name} must be positive, got {value}")
         self.epsilon, self.samples, self.reach = epsilon, samples, reach
         self.views: ModelViews = model_views(model)
-        for direction in range(len(self.views.directions)):
-            self.views.visible_tree(direction)  # now, so that no view waits for it later
+        self.views.nearest_visible(np.zeros((1, 3)), np.zeros(1), epsilon)  # now, so that no view waits for it later
 
     def score(self, depth: np.ndarray, camera: PinholeCamera, hypotheses: Hypotheses) -> np.ndarray:
         """Verification scores c of all hypotheses of a view.
@@ -67,58 +66,62 @@ class Verifier:
         """
         if depth.shape != hypotheses.segmentation.shape:
             raise ValueError(f"depth image is {depth.shape}, the masks are {hypotheses.segmentation.shape}")
-        pixels = [self._mask_pixels(depth, hypotheses, index) for index in range(len(hypotheses))]
-        counts = [len(found) for found in pixels]
-        if sum(counts) == 0:
-            return np.zeros(len(hypotheses))
-        points, normals = points_and_normals(depth, camera, np.concatenate(pixels), self.reach)
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        directions = self.views.nearest_direction(hypotheses.T_camera_object)
-        scores = np.zeros(len(hypotheses))
-        for index in np.flatnonzero(counts):
-            part = slice(starts[index], starts[index + 1])
-            T, direction = hypotheses.T_camera_object[index], directions[index]
-            scores[index] = self.fits(points[part], normals[part], T, direction).mean()
-        return scores
+        pixels, owner = self.mask_pixels(depth, hypotheses)
+        points, normals = points_and_normals(depth, camera, pixels, self.reach)
+        fits = self.fits(points, normals, hypotheses.T_camera_object, owner)
+        count = np.bincount(owner, minlength=len(hypotheses))
+        return np.bincount(owner, fits, len(hypotheses)) / np.maximum(count, 1)
 
-    def fits(self, points: np.ndarray, normals: np.ndarray, T_camera_object: np.ndarray, direction: int) -> np.ndarray:
+    def fits(
+        self, points: np.ndarray, normals: np.ndarray, T_camera_object: np.ndarray, owner: np.ndarray
+    ) -> np.ndarray:
         """delta(p, q) per scene point.
 
         Args:
             points: (n, 3) scene points q in the optical frame.
             normals: (n, 3) their normals facing the camera, zero where unknown: such a point is judged by its distance.
-            T_camera_object: (4, 4) pose of the hypothesis.
-            direction: index of the model's view direction.
+            T_camera_object: (k, 4, 4) poses of the hypotheses.
+            owner: (n,) hypothesis that each point is judged by.
 
         Returns:
             (n,) values of equation 1.
         """
-        R = T_camera_object[:3, :3]
-        q = (points - T_camera_object[:3, 3]) @ R
-        visible, tree = self.views.visible_tree(int(direction))
-        distance, found = tree.query(q, distance_upper_bound=self.epsilon + self.views.spacing)
-        reached = np.flatnonzero(np.isfinite(distance))
-        p = visible[found[reached]]
+        R, t = T_camera_object[owner, :3, :3], T_camera_object[owner, :3, 3]
+        q = np.einsum("ni,nij->nj", points - t, R)
+        direction = self.views.nearest_direction(T_camera_object)[owner]
+        distance, p = self.views.nearest_visible(q, direction, self.epsilon + self.views.spacing)
+        reached = np.flatnonzero(p >= 0)
+        q, p, distance = q[reached], p[reached], distance[reached]
         n_p = self.views.normals[p]
-        off_plane = np.einsum("ni,ni->n", q[reached] - self.views.points[p], n_p)
-        along = np.sqrt(np.maximum(distance[reached] ** 2 - off_plane**2, 0.0))
+        off_plane = np.einsum("ni,ni->n", q - self.views.points[p], n_p)
+        along = np.sqrt(np.maximum(distance**2 - off_plane**2, 0.0))
         to_surface = np.hypot(off_plane, np.maximum(along - self.views.spacing, 0.0))
+        product = np.einsum("ni,ni->n", np.einsum("ni,nij->nj", normals, R)[reached], n_p)
         fits = np.zeros(len(points))
-        fits[reached] = local_fit(to_surface, np.einsum("ni,ni->n", n_p, normals[reached] @ R), self.epsilon)
+        fits[reached] = local_fit(to_surface, product, self.epsilon)
         return fits
 
-    def _mask_pixels(self, depth: np.ndarray, hypotheses: Hypotheses, index: int) -> np.ndarray:
-        """Flat indices of at most ``samples`` pixels with depth inside one mask, evenly spaced in raster order."""
+    def mask_pixels(self, depth: np.ndarray, hypotheses: Hypotheses) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels with depth inside the masks, at most ``samples`` of each, evenly spaced in raster order.
+
+        Returns:
+            (n,) flat indices, mask by mask, and (n,) the hypotheses that they belong to.
+        """
         height, width = depth.shape
-        size = (width, height, width, height)
-        x0, y0, x1, y1 = np.rint(np.clip(hypotheses.box[index], 0.0, 1.0) * size).astype(int)
-        crop = (slice(y0, y1), slice(x0, x1))
-        inside = (hypotheses.segmentation[crop] == hypotheses.label[index]) & np.isfinite(depth[crop])
-        flat = np.flatnonzero(inside)
-        if len(flat) > self.samples:
-            flat = flat[np.linspace(0, len(flat) - 1, self.samples).astype(np.intp)]
-        rows, columns = np.divmod(flat, max(x1 - x0, 1))
-        return (rows + y0) * width + columns + x0
+        corners = np.rint(np.clip(hypotheses.box, 0.0, 1.0) * (width, height, width, height)).astype(int)
+        inside = []
+        for (x0, y0, x1, y1), label in zip(corners.tolist(), hypotheses.label, strict=True):
+            crop = (slice(y0, y1), slice(x0, x1))
+            inside.append(np.flatnonzero((hypotheses.segmentation[crop] == label) & np.isfinite(depth[crop])))
+        sizes = np.array([len(flat) for flat in inside], int)
+        counts = np.minimum(sizes, self.samples)
+        owner = np.repeat(np.arange(len(hypotheses)), counts)
+        place = np.arange(len(owner)) - (np.cumsum(counts) - counts)[owner]
+        stretched = place * (sizes[owner] - 1) // max(self.samples - 1, 1)
+        chosen = np.where(sizes[owner] > self.samples, stretched, place) + (np.cumsum(sizes) - sizes)[owner]
+        x0, y0, x1, _ = corners[owner].T
+        rows, columns = np.divmod(np.concatenate([*inside, np.zeros(0, int)])[chosen], x1 - x0)
+        return (rows + y0) * width + columns + x0, owner
 
 
 def points_and_normals(
@@ -145,19 +148,21 @@ def points_and_normals(
     for du, dv in ((reach, 0), (0, reach)):
         after = _backproject(depth, camera, np.minimum(u + du, width - 1), np.minimum(v + dv, height - 1)) - points
         before = points - _backproject(depth, camera, np.maximum(u - du, 0), np.maximum(v - dv, 0))
-        jump_after, jump_before = np.abs(after[:, 2]), np.abs(before[:, 2])
-        flatter = np.nan_to_num(jump_after, nan=np.inf) <= np.nan_to_num(jump_before, nan=np.inf)
-        one_side = np.where(flatter[:, None], after, before)
+        jump_after, jump_before = np.abs(after[2]), np.abs(before[2])
+        one_side = np.where((jump_after <= jump_before) | np.isnan(jump_before), after, before)
         # A smooth surface changes its slope little within a few pixels; 5 mm between the two sides is an edge.
         smooth = np.abs(jump_after - jump_before) < 0.005
-        tangents.append(np.where(smooth[:, None], after + before, one_side))
-    cross = np.nan_to_num(np.cross(tangents[1], tangents[0]))
-    length = np.linalg.norm(cross, axis=1, keepdims=True)
-    normals = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
-    normals[np.einsum("ni,ni->n", normals, points) > 0] *= -1
-    return points, normals
+        tangents.append(np.where(smooth, after + before, one_side))
+    (ax, ay, az), (bx, by, bz) = tangents
+    normals = np.nan_to_num(np.stack([by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax]))
+    length = np.sqrt((normals**2).sum(axis=0))
+    # Facing the camera is against the ray to the point.
+    length[(normals * points).sum(axis=0) > 0] *= -1
+    np.divide(normals, length, out=normals, where=length != 0)
+    return points.T, normals.T
 
 
 def _backproject(depth: np.ndarray, camera: PinholeCamera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """(3, n) points at pixels: coordinates first, so that each is one contiguous row."""
     z = depth[v, u].astype(float)
-    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
