@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.context import Context
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_harness import fresh_domain
+from ros_harness import fresh_domain, reliable
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
@@ -87,14 +87,42 @@ def test_a_defect_in_a_callback_is_not_hidden(graph):
 
 
 def test_inputs_are_ignored_until_the_node_is_active(graph):
-    node = graph.add(DepthNode(context=graph.context), start=False)
-    results = graph.mailbox(String, "result")
-    graph.publish("depth", depth_to_image(np.ones((2, 2), np.float32), 1, "c"), latched=True)
+    node = graph.add(DriverNode(context=graph.context), start=False)
+    publisher = graph.node.create_publisher(Image, "camera/depth", reliable())
+    graph.spin_until(publisher.get_subscription_count)
+    publisher.publish(depth_to_image(np.ones((2, 2), np.float32), 1_000_000_000, "c"))
     graph.spin_for(0.3)
+    node.start()
+    publisher.publish(depth_to_image(np.ones((2, 2), np.float32), 2_000_000_000, "c"))
+    graph.spin_until(lambda: node.stamps)
+    assert node.stamps == [2]
+
+
+def test_latched_inputs_wait_for_activation(graph):
+    """What a node heard while inactive it takes once, in order, as many as are latched, and then what comes."""
+    node = graph.add(DepthNode(context=graph.context), start=False)
+    results, diagnostics = graph.mailbox(String, "result", True), graph.mailbox(DiagnosticArray, "/diagnostics")
+
+    def send(value):
+        graph.publish("depth", depth_to_image(np.full((2, 2), value, np.float32), 1, "c"), latched=True)
+
+    for value in range(1, 14):
+        send(value)
+    bad = depth_to_image(np.ones((2, 2), np.float32), 1, "c")
+    bad.encoding = "rgb8"
+    graph.publish("depth", bad, latched=True)
+    graph.spin_until(lambda: len(node._held[0][1]) == 10 and node._held[0][1][-1].encoding == "rgb8")
     assert results == []
     node.start()
-    graph.publish("depth", depth_to_image(np.ones((2, 2), np.float32), 2, "c"), latched=True)
-    graph.spin_until_filled([results])
+    graph.spin_until_filled([results], 9)
+    graph.spin_until(lambda: any("'rgb8' is not 32FC1" in d.status[0].message for d in diagnostics))
+    node.trigger_deactivate()
+    send(14)
+    graph.spin_until(lambda: node._held[0][1])
+    node.trigger_activate()
+    send(15)
+    graph.spin_until_filled([results], 11)
+    assert [result.data for result in results] == [f"{value:.1f}" for value in (*range(5, 14), 14, 15)]
 
 
 def test_a_failing_setup_is_reported_with_its_reason(graph):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray
+from rcl_interfaces.msg import Log
 from sensor_msgs.msg import Image, PointCloud2
-from visualization_msgs.msg import MarkerArray
+from visualization_msgs.msg import Marker, MarkerArray
 
 from active6d_core.camera import DEFAULT_CAMERA
 from active6d_core.conversions import (
@@ -229,6 +230,42 @@ def test_fusion_publishes_verified_objects(graph, fusion, seen, tmp_path):
     assert len(poses[0].poses) == 1
     assert markers[0].markers[1].mesh_resource == (tmp_path / "active6d/meshes/mug.stl").as_uri()
     assert (tmp_path / "active6d/meshes/mug.stl").stat().st_size > 1000
+
+
+def test_fusion_without_a_writable_cache_sends_no_markers(graph, seen, tmp_path, monkeypatch):
+    (tmp_path / "cache").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    objects, markers = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(MarkerArray, "objects/markers", True)
+    logged = graph.mailbox(Log, "/rosout")
+    graph.add(HypothesisFusionNode(context=graph.context))
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects, markers])
+    assert objects[0].width == 1
+    assert [marker.action for marker in markers[0].markers] == [Marker.DELETEALL]
+    graph.spin_until(lambda: any("objects/markers stays empty" in entry.msg for entry in logged))
+
+
+def test_nodes_that_are_activated_last_take_the_views_so_far(graph, tmp_path, monkeypatch, seen):
+    """Everything was said before either node was active, as with autostart off."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    objects = graph.mailbox(PointCloud2, "objects", True)
+    fusion = graph.add(HypothesisFusionNode(context=graph.context), start=False)
+    estimator = graph.add(
+        PoseEstimatorNode(context=graph.context, overrides={"estimator": "nearest-pixel"}), start=False
+    )
+    start = DiagnosticArray(status=[DiagnosticStatus()])
+    start.header.stamp = ns_to_stamp(SECOND)
+    graph.publish("episode/start", start, latched=True)
+    for stamp in (SECOND, 2 * SECOND):
+        send(graph, camera_messages(stamp))
+    graph.spin_until(lambda: all(len(held) == 2 for _, held in [*estimator._held, *fusion._held[-3:]]))
+    estimator.start()
+    graph.spin_for(0.2)
+    assert not objects
+    fusion.start()
+    graph.spin_until_filled([objects], 2)
+    assert [stamp_to_ns(message.header.stamp) for message in objects] == [SECOND, 2 * SECOND]
+    assert objects_from_cloud(objects[1], "world").support[0] == 2
 
 
 def test_fusion_hands_the_objects_to_the_detections_too(graph, fusion, seen, monkeypatch):

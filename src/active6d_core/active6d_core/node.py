@@ -4,6 +4,7 @@ import json
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -34,7 +35,8 @@ class GraphNode(LifecycleNode):
     """A lifecycle node that survives bad input and says how it is doing.
 
     Subclasses declare parameters and create inputs and outputs in ``__init__``, do what is heavy in :meth:`setup`, and
-    start their work in :meth:`begin`. Inputs are ignored until the node is active.
+    start their work in :meth:`begin`. What comes while the node is not active is ignored, but for the last messages of
+    latched inputs: the node gets them when it is activated, as if it had come late.
 
     Raises:
         ValueError: a parameter is out of its range or of another type; the message names it.
@@ -51,6 +53,7 @@ class GraphNode(LifecycleNode):
         parameters = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
         super().__init__(name, context=context, namespace=namespace, parameter_overrides=parameters)
         self._active = False
+        self._held: list[tuple[Callable[[Any], None], deque]] = []
         self._failure: Exception | None = None
         self._views_measured = 0
         self._rejected = 0
@@ -128,14 +131,19 @@ class GraphNode(LifecycleNode):
     def _subscribe(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
+        latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        held = deque(maxlen=qos.depth if latched else 0)
+
         def guarded(message: Any) -> None:
             if not self._active:
+                held.append(message)
                 return
             try:
                 callback(message)
             except MessageError as error:
                 self.reject(f"{topic}: {error}")
 
+        self._held.append((guarded, held))
         return self.create_subscription(message_type, topic, guarded, qos, qos_overriding_options=_overridable())
 
     # Diagnostics
@@ -191,13 +199,20 @@ class GraphNode(LifecycleNode):
         return self._attempt(self.setup)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open the outputs, then run :meth:`begin`."""
+        """Open the outputs, run :meth:`begin`, then take what latched inputs brought before."""
         super().on_activate(state)
         self._active = True
         result = self._attempt(self.begin)
+        if result == TransitionCallbackReturn.SUCCESS:
+            result = self._attempt(self._take_held)
         if result != TransitionCallbackReturn.SUCCESS:
             self.on_deactivate(state)
         return result
+
+    def _take_held(self) -> None:
+        for callback, held in self._held:
+            while held:
+                callback(held.popleft())
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close inputs and outputs."""

@@ -6,28 +6,27 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray, PoseStamped
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from geometry_msgs.msg import PoseArray
+from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.conversions import (
     MessageError,
     hypotheses_from_cloud,
-    image_to_depth,
     image_to_segmentation,
-    info_to_camera,
     objects_to_cloud,
     objects_to_markers,
-    pose_stamped_to_transform,
     poses_to_array,
     require_frame,
     stamp_to_ns,
 )
-from active6d_core.node import GraphNode, StampSynchronizer, run_node
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.node import GraphNode, run_node
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.optional_outputs import DetectionOutput
 from active6d_perception.fusion import FusionParameters, SceneFusion
+from active6d_perception.nodes.view_inputs import ViewInputs
 from active6d_perception.verification import Verifier
 
 
@@ -60,7 +59,6 @@ class HypothesisFusionNode(GraphNode):
                 maximum=1.0,
             ),
         )
-        latched = self.declare("latched_camera", True, "camera topics are transient-local, false for plain drivers")
         self._objects = self.output(PointCloud2, "objects", latched=True)
         self._poses = self.output(PoseArray, "objects/poses", latched=True)
         self._markers = self.output(MarkerArray, "objects/markers", latched=True)
@@ -69,43 +67,34 @@ class HypothesisFusionNode(GraphNode):
         self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
         self.input(PointCloud2, "hypotheses", self._on_hypotheses, latched=True)
         self.input(Image, "hypotheses/segmentation", self._on_segmentation, latched=True)
-        self.camera_input(Image, "camera/depth/image_raw", self._on_depth, latched)
-        self.camera_input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
-        self.camera_input(PoseStamped, "camera/pose", self._on_pose, latched)
+        self._inputs = ViewInputs(self, ("depth", "camera", "pose"), self._on_view, ("hypotheses", "segmentation"))
 
     def setup(self) -> None:
         """Load the object and precompute its views; nothing is known of any view."""
         self._latest: tuple[int, np.ndarray, PinholeCamera] | None = None
         self._episode_start = 0
-        self._views = StampSynchronizer(("hypotheses", "segmentation", "depth", "camera", "pose"), self._on_view)
+        self._inputs.reset()
         self._model = load_object(self._object)
         self._verifier = Verifier(self._model, self._epsilon, self._samples)
         self._fusion = SceneFusion(self._model, self._fusion_parameters)
-        self._mesh_uri = export_mesh(self._model)
+        try:
+            self._mesh_uri = export_mesh(self._model)
+        except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
+            self._mesh_uri = None
+            self.get_logger().warning(f"objects/markers stays empty, the mesh cannot be written for viewers: {error}")
 
     def _on_hypotheses(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
         if self._is_latest(stamp):
             self._publish()  # a restarted estimator repeats its last view; whoever awaits the result gets it again
         else:
-            self._views.add("hypotheses", stamp, message)
+            self._inputs.add("hypotheses", stamp, message)
 
     def _on_segmentation(self, message: Image) -> None:
         require_frame(message.header, self.camera_frame)
         stamp = stamp_to_ns(message.header.stamp)
         if not self._is_latest(stamp):
-            self._views.add("segmentation", stamp, image_to_segmentation(message))
-
-    def _on_depth(self, message: Image) -> None:
-        require_frame(message.header, self.camera_frame)
-        self._views.add("depth", stamp_to_ns(message.header.stamp), image_to_depth(message))
-
-    def _on_camera(self, message: CameraInfo) -> None:
-        require_frame(message.header, self.camera_frame)
-        self._views.add("camera", stamp_to_ns(message.header.stamp), info_to_camera(message))
-
-    def _on_pose(self, message: PoseStamped) -> None:
-        self._views.add("pose", stamp_to_ns(message.header.stamp), pose_stamped_to_transform(message, self.world_frame))
+            self._inputs.add("segmentation", stamp, image_to_segmentation(message))
 
     def _on_episode_start(self, message: DiagnosticArray) -> None:
         start = self._episode_start = stamp_to_ns(message.header.stamp)
@@ -116,15 +105,11 @@ class HypothesisFusionNode(GraphNode):
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
         if stamp < self._episode_start:  # the estimator was still at it when the scene changed
             raise MessageError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
-        camera, depth, segmentation = values["camera"], values["depth"], values["segmentation"]
-        size = (camera.height, camera.width)
-        if depth.shape != size or segmentation.shape != size:
-            raise MessageError(f"camera_info says {size}, depth is {depth.shape}, masks are {segmentation.shape}")
-        hypotheses = hypotheses_from_cloud(values["hypotheses"], segmentation, self.camera_frame)
+        hypotheses = hypotheses_from_cloud(values["hypotheses"], values["segmentation"], self.camera_frame)
         with self.measure(stamp):
-            verification = self._verifier.score(depth, camera, hypotheses)
+            verification = self._verifier.score(values["depth"], values["camera"], hypotheses)
             self._fusion.add_view(stamp, values["pose"], hypotheses, verification)
-            self._latest = stamp, values["pose"], camera
+            self._latest = stamp, values["pose"], values["camera"]
             self._publish()
 
     def _is_latest(self, stamp: int) -> bool:
@@ -135,7 +120,8 @@ class HypothesisFusionNode(GraphNode):
         objects = self._fusion.objects(*self._latest)
         self._objects.publish(objects_to_cloud(objects, stamp, self.world_frame))
         self._poses.publish(poses_to_array(objects.T_world_object, stamp, self.world_frame))
-        self._markers.publish(objects_to_markers(objects, self._mesh_uri, stamp, self.world_frame))
+        shown = objects if self._mesh_uri else SceneObjects.empty()
+        self._markers.publish(objects_to_markers(shown, self._mesh_uri or "", stamp, self.world_frame))
         self._detections.publish(objects, self._model, stamp, self.world_frame)
 
 

@@ -4,25 +4,15 @@ from typing import Any
 
 import numpy as np
 import yaml
-from geometry_msgs.msg import PoseArray, PoseStamped
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from geometry_msgs.msg import PoseArray
+from sensor_msgs.msg import Image, PointCloud2
 
 from active6d_core.camera import View
-from active6d_core.conversions import (
-    MessageError,
-    hypotheses_to_cloud,
-    image_to_color,
-    image_to_depth,
-    info_to_camera,
-    pose_stamped_to_transform,
-    poses_to_array,
-    require_frame,
-    segmentation_to_image,
-    stamp_to_ns,
-)
-from active6d_core.node import GraphNode, StampSynchronizer, run_node
+from active6d_core.conversions import hypotheses_to_cloud, poses_to_array, segmentation_to_image
+from active6d_core.node import GraphNode, run_node
 from active6d_core.object_model import load_object
 from active6d_perception.estimator import AUTOMATIC, Estimator, create_estimator, list_estimators
+from active6d_perception.nodes.view_inputs import ViewInputs
 
 
 class PoseEstimatorNode(GraphNode):
@@ -43,22 +33,17 @@ class PoseEstimatorNode(GraphNode):
         self._settings = self.declare(
             "estimator_parameters", "{}", "the estimator's own parameters, a YAML mapping such as {min_score: 0.4}"
         )
-        latched = self.declare("latched_camera", True, "camera topics are transient-local, false for plain drivers")
         use_pose = self.declare("use_camera_pose", False, "wait for camera/pose too and pass it to the estimator")
         self._estimator: Estimator | None = None
         self._hypotheses = self.output(PointCloud2, "hypotheses", latched=True)
         self._poses = self.output(PoseArray, "hypotheses/poses", latched=True)
         self._segmentation = self.output(Image, "hypotheses/segmentation", latched=True)
-        self._awaited = ["color", "depth", "camera"] + ["pose"] * use_pose
-        self.camera_input(Image, "camera/color/image_raw", self._on_color, latched)
-        self.camera_input(Image, "camera/depth/image_raw", self._on_depth, latched)
-        self.camera_input(CameraInfo, "camera/color/camera_info", self._on_camera, latched)
-        if use_pose:
-            self.camera_input(PoseStamped, "camera/pose", self._on_pose, latched)
+        parts = ["color", "depth", "camera"] + ["pose"] * use_pose
+        self._inputs = ViewInputs(self, parts, self._on_view)
 
     def setup(self) -> None:
         """Load the object and make the estimator."""
-        self._views = StampSynchronizer(self._awaited, self._on_view)
+        self._inputs.reset()
         self._estimator = create_estimator(self._name, load_object(self._object), **self._read_settings())
 
     def teardown(self) -> None:
@@ -74,27 +59,8 @@ class PoseEstimatorNode(GraphNode):
             raise ValueError(f"{self.get_name()}: parameter 'estimator_parameters' must be a YAML mapping")
         return settings
 
-    def _on_color(self, message: Image) -> None:
-        require_frame(message.header, self.camera_frame)
-        self._views.add("color", stamp_to_ns(message.header.stamp), image_to_color(message))
-
-    def _on_depth(self, message: Image) -> None:
-        require_frame(message.header, self.camera_frame)
-        self._views.add("depth", stamp_to_ns(message.header.stamp), image_to_depth(message))
-
-    def _on_camera(self, message: CameraInfo) -> None:
-        require_frame(message.header, self.camera_frame)
-        self._views.add("camera", stamp_to_ns(message.header.stamp), info_to_camera(message))
-
-    def _on_pose(self, message: PoseStamped) -> None:
-        self._views.add("pose", stamp_to_ns(message.header.stamp), pose_stamped_to_transform(message, self.world_frame))
-
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
-        camera, depth, color = values["camera"], values["depth"], values["color"]
-        size = (camera.height, camera.width)
-        if depth.shape != size or color.shape[:2] != size:
-            raise MessageError(f"camera_info says {size}, depth is {depth.shape}, color is {color.shape[:2]}")
-        view = View(stamp, color, depth, camera, values.get("pose", np.eye(4)))
+        view = View(stamp, values["color"], values["depth"], values["camera"], values.get("pose", np.eye(4)))
         with self.measure(stamp):
             found = self._estimator.estimate(view)
             self._segmentation.publish(segmentation_to_image(found.segmentation, stamp, self.camera_frame))
