@@ -25,7 +25,8 @@ def items(name: str) -> list[tuple[str, ast.expr]]:
 def test_every_argument_has_a_description():
     descriptions = {name: entry.elts[2].value for name, entry in items("ARGUMENTS")}
     wanted = (
-        "object policy seed scene steps estimator camera record bag rviz namespace params_file autostart use_sim_time"
+        "object policy seed scene steps metres estimator camera latched_camera record bag rviz namespace params_file"
+        " autostart use_sim_time"
     )
     assert set(descriptions) == set(wanted.split())
     assert all(len(description) > 10 for description in descriptions.values())
@@ -39,6 +40,15 @@ def test_nodes_take_what_the_launch_file_gives(node):
     types = {name: value.id for name, value in items("TYPES")}
     for name in [*given, "autostart", "use_sim_time"]:
         assert type(node.get_parameter(name).value).__name__ == types.get(name, "str"), name
+
+
+def test_every_argument_reaches_every_node_that_has_it(node):
+    """But for what is one node's own: the first view's seed is the camera's, the policy's budget the policy's."""
+    package, given = ast.literal_eval(table("NODES")).get(node.get_name(), (None, []))
+    if package is None:
+        pytest.skip("not launched")
+    shared = {"object", "latched_camera", "metres", "steps"}
+    assert {name for name in shared if node.has_parameter(name)} == shared & set(given)
 
 
 def test_every_executable_exists():

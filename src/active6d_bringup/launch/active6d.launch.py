@@ -22,6 +22,8 @@ ARGUMENTS = {
     "estimator": ("", None, "which pose estimator; empty: as in params_file"),
     "policy": ("", None, "which policy chooses the views; empty: as in params_file"),
     "steps": ("", None, "moves in an episode; empty: as in params_file"),
+    "metres": ("", None, "of travel in an episode, 0.0 for any; empty: as in params_file"),
+    "latched_camera": ("", ["", "true", "false"], "false for a driver that keeps no views; empty: as in params_file"),
     "autostart": ("true", ["true", "false"], "nodes configure and activate themselves; false: `ros2 lifecycle set`"),
     "use_sim_time": ("false", ["true", "false"], "take the nodes' clock from /clock; stamps of views never do"),
     "record": ("false", ["true", "false"], "record every topic of the graph"),
@@ -33,13 +35,20 @@ ARGUMENTS = {
 NODES = {
     "camera_simulator": ("active6d_sim", ["object", "seed", "scene"]),
     "dataset_camera": ("active6d_sim", ["object", "scene"]),
-    "pose_estimator": ("active6d_perception", ["object", "estimator"]),
-    "hypothesis_fusion": ("active6d_perception", ["object"]),
-    "attention_policy": ("active6d_agent", ["object", "policy", "seed", "steps"]),
-    "episode_recorder": ("active6d_bringup", ["bag"]),
+    "pose_estimator": ("active6d_perception", ["object", "estimator", "latched_camera"]),
+    "hypothesis_fusion": ("active6d_perception", ["object", "latched_camera"]),
+    "attention_policy": ("active6d_agent", ["object", "policy", "seed", "steps", "metres", "latched_camera"]),
+    "episode_recorder": ("active6d_bringup", ["bag", "latched_camera"]),
 }
 CAMERAS = {"simulator": ["camera_simulator"], "dataset": ["dataset_camera"], "none": []}
-TYPES = {"seed": int, "steps": int, "autostart": bool, "use_sim_time": bool}
+TYPES = {
+    "seed": int,
+    "steps": int,
+    "metres": float,
+    "latched_camera": bool,
+    "autostart": bool,
+    "use_sim_time": bool,
+}
 
 
 def _node(executable: str, given: dict[str, str], **process_options) -> Node:
