@@ -117,12 +117,14 @@ class DenseEstimator:
 
     Attributes:
         stage_ms: duration of each stage of the last view, milliseconds.
+        certainty: (k,) :attr:`Poses.certainty` of the hypotheses of the last view.
     """
 
     def __init__(self, model: ObjectModel, trained: TrainedNetwork, parameters: DenseParameters | None = None) -> None:
         self.model = model
         self.parameters = parameters or DenseParameters()
         self.stage_ms: dict[str, float] = {}
+        self.certainty = np.zeros(0)
         self._trained = trained
         self._precision = torch.bfloat16 if has_fast_bfloat16() else torch.float32
         self._network = fused(trained.network).to(dtype=self._precision, memory_format=torch.channels_last)
@@ -136,6 +138,7 @@ class DenseEstimator:
         self.stage_ms = {}
         reduced = self._timed("input", reduce_view, view)
         poses, label = self.locate(reduced)
+        self.certainty = poses.certainty
         if not len(poses.score):
             return Hypotheses.empty(view.camera.height, view.camera.width)
         factor = reduction(view.camera)
