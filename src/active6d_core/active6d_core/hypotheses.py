@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from scipy.ndimage import find_objects
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,20 +70,18 @@ class Hypotheses:
         members = np.flatnonzero(flat)
         labels_of_members = flat[members].astype(np.intp)
         size = int(max(labels_of_members.max(initial=0), label.max(initial=0))) + 1
-        rows, columns = np.divmod(members, width)
-        low = np.full((size, 2), np.inf)
-        high = np.full((size, 2), -np.inf)
-        for axis, coordinate in enumerate((columns, rows)):
-            np.minimum.at(low[:, axis], labels_of_members, coordinate)
-            np.maximum.at(high[:, axis], labels_of_members, coordinate + 1)
-        if not np.isfinite(low[label]).all():
+        found = [None, *find_objects(segmentation, size - 1)]
+        if any(found[index] is None for index in label):
             raise ValueError("hypotheses: a label has no pixel in the segmentation")
+        pixels = [
+            (columns.start, rows.start, columns.stop, rows.stop) for rows, columns in map(found.__getitem__, label)
+        ]
         z = depth_image.ravel()[members]
         valid = np.isfinite(z)
         count = np.bincount(labels_of_members[valid], minlength=size)[label]
         total = np.bincount(labels_of_members[valid], weights=z[valid], minlength=size)[label]
         depth = np.where(count > 0, total / np.maximum(count, 1), T_camera_object[:, 2, 3])
-        box = np.concatenate([low[label], high[label]], axis=1) / (width, height, width, height)
+        box = np.reshape(pixels, (-1, 4)) / (width, height, width, height)
         return cls(np.asarray(T_camera_object, float), np.asarray(score, float), box, depth, label, segmentation)
 
     @classmethod

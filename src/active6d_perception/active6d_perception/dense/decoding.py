@@ -74,7 +74,8 @@ def decode(
     """
     probability = expit(answer[0])
     pixel = np.flatnonzero((probability > parameters.mask_threshold) & np.isfinite(depth))
-    parts = split(answer.reshape(len(answer), -1).T[pixel])
+    # Channels last, as the network answers, this is a view and each pixel's answer is together.
+    parts = split(np.moveaxis(answer, 0, -1).reshape(-1, len(answer))[pixel])
     points = pixel_rays(camera).reshape(-1, 3)[pixel] * depth.ravel()[pixel, None]
     votes = points + diameter * np.einsum("pij,pj->pi", ray_frames(camera).reshape(-1, 3, 3)[pixel], parts["centre"])
     weight = np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))

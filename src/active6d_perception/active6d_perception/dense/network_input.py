@@ -51,11 +51,20 @@ def reduce_view(view: View) -> ReducedView:
     """Reduce a view to the network's resolution; what the factor does not divide is cut off at the right and bottom."""
     factor = reduction(view.camera)
     height, width = (size // factor for size in view.depth.shape)
-    blocks = view.color[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
-    color = blocks.mean(axis=(1, 3), dtype=np.float32).round().astype(np.uint8)
+    color = _pool_color(view.color, factor)
     exact = view.camera.scaled(1 / factor)
     camera = PinholeCamera(width, height, exact.fx, exact.fy, exact.cx, exact.cy)
     return ReducedView(color, pool_depth(view.depth, factor), camera)
+
+
+def _pool_color(color: np.ndarray, factor: int) -> np.ndarray:
+    """(H, W, 3) uint8 to (H // factor, W // factor, 3) uint8, the rounded mean of each block."""
+    height, width = (size // factor * factor for size in color.shape[:2])
+    total = np.full((height // factor, width // factor, 3), factor * factor // 2, np.uint32)
+    for row in range(factor):
+        for column in range(factor):
+            total += color[row:height:factor, column:width:factor]
+    return (total // (factor * factor)).astype(np.uint8)
 
 
 def pool_depth(depth: np.ndarray, factor: int) -> np.ndarray:

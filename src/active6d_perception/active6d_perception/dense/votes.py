@@ -40,8 +40,9 @@ def cluster_votes(votes: np.ndarray, weight: np.ndarray, diameter: float, fewest
     """
     if len(votes) < fewest:
         return Clusters(np.zeros((0, 3)), np.full(len(votes), -1))
-    _, voxel = np.unique(np.floor(votes / (_VOXEL * diameter)).astype(np.int64), axis=0, return_inverse=True)
-    voxel = voxel.ravel()
+    cell = np.floor(votes / (_VOXEL * diameter)).astype(np.int64)
+    cell -= cell.min(axis=0)
+    _, voxel = np.unique(np.ravel_multi_index(cell.T, cell.max(axis=0) + 1), return_inverse=True)
     mass = np.bincount(voxel, weights=weight)
     points = np.stack([np.bincount(voxel, weights=weight * votes[:, i]) for i in range(3)], axis=1) / mass[:, None]
     heaviest = np.argsort(-mass, kind="stable")[:_MOST_VOXELS]
