@@ -69,8 +69,9 @@ def test_finds_most_of_what_a_heap_shows(name, found, right):
     model = load_object(name)
     result = evaluate_estimator(create_estimator("geometric", model), model, captures(model, (45, 70), seed=11))
     assert result.detection_rate(0.5, "adds") >= found
-    assert result.right_adds.mean() >= right
-    assert result.verification[result.right_adds].mean() > 0.5
+    is_right = result.right("adds")
+    assert is_right.mean() >= right
+    assert result.gather("verification")[is_right].mean() > 0.5
 
 
 def test_is_deterministic_and_looks_at_depth_only():

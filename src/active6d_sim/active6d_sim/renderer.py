@@ -153,6 +153,12 @@ class SceneRenderer:
         silhouettes[crossed[crossed >= 0], crossings["ray_ids"].numpy()[crossed >= 0]] = True
         return np.bincount(first[first >= 0], minlength=count), silhouettes.sum(axis=1)
 
+    def sees(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """(p,) bool, whether nothing lies between (3,) ``eye`` and (p, 3) ``points`` on surfaces, all in the world."""
+        directions = (points - eye).astype(np.float32)
+        # A hit at parameter 1 is the point itself; within 0.1 % is rounding, not an occluder.
+        return self._cast(eye.astype(np.float32), directions)[0] > 0.999
+
     def _cast(self, eye: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Directions with z = 1 in the camera frame make the ray's parameter the depth. Misses get the extra face."""
         answer = self._caster.cast_rays(_rays(eye, directions), nthreads=self._threads)

@@ -5,7 +5,7 @@ import numpy as np
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View
 from active6d_core.se3 import is_rigid
 from active6d_core.view_sphere import ViewSphere
-from active6d_sim.renderer import SceneRenderer
+from active6d_sim.renderer import RenderedView, SceneRenderer
 from active6d_sim.scene import Scene
 from active6d_sim.sensor import SensorNoise, apply
 
@@ -30,13 +30,16 @@ class Simulator:
             seed: of the sensor's noise and of the scene's looks.
         """
         self.scene, self.camera, self.noise, self.seed = scene, camera, noise, seed
-        self._renderer = SceneRenderer(scene, appearance_seed=seed)
+        self.renderer = SceneRenderer(scene, appearance_seed=seed)
 
     def capture(self, T_world_camera: np.ndarray, stamp: int) -> View:
         """The view from (4, 4) ``T_world_camera``; its noise depends on the seed and ``stamp`` (nanoseconds) alone."""
-        rendered = self._renderer.render(T_world_camera, self.camera)
+        return self.sense(self.renderer.render(T_world_camera, self.camera), T_world_camera, stamp, self.noise)
+
+    def sense(self, rendered: RenderedView, T_world_camera: np.ndarray, stamp: int, noise: SensorNoise) -> View:
+        """What the sensor makes of a view rendered from (4, 4) ``T_world_camera``, with other noise than its own."""
         rng = np.random.default_rng([self.seed, stamp])
-        color, depth = apply(rendered, self.camera, self.noise, rng)
+        color, depth = apply(rendered, self.camera, noise, rng)
         return View(stamp, color, depth, self.camera, np.array(T_world_camera, float))
 
 

@@ -1,127 +1,168 @@
-"""How well and how fast estimators find objects in single views of stored scenes, and how much fusion adds."""
+"""Runs estimators on the same views of stored scenes, and counts how much fusion of several views adds."""
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
-from itertools import islice
+import hashlib
+import resource
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from active6d_bringup.benchmark.estimator_summary import summarise
+from active6d_bringup.benchmark.grid_views import GridViews
+from active6d_bringup.benchmark.peers import PEERS
+from active6d_bringup.benchmark.records import Records
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimator import create_estimator
-from active6d_perception.evaluation import EstimatorResult, LabelledView, detection_over_views, evaluate_estimator
-from active6d_sim.scene import Scene
+from active6d_perception.estimator import Estimator, create_estimator, weights_path
+from active6d_perception.evaluation import EstimatorResult, detection_over_views, evaluate_view
+from active6d_perception.verification import Verifier
 from active6d_sim.scene_store import SPLITS, load_scene
-from active6d_sim.sensor import SensorNoise
-from active6d_sim.simulator import Simulator
 
-#: Visible fractions from which on objects are counted.
-VISIBLE = (0.5, 0.1)
 OnProgress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """An estimator that takes part.
+
+    Attributes:
+        name: of the estimator or of the peer.
+        identity: the name and, for a learned one, which weights.
+        estimator: ready to run.
+    """
+
+    name: str
+    identity: str
+    estimator: Estimator
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What was measured.
+
+    Attributes:
+        document: what ``active6d benchmark estimator --json`` writes.
+        results: of all views by (noise, name of the estimator).
+    """
+
+    document: dict[str, Any]
+    results: dict[tuple[float, str], EstimatorResult]
+
+
+def enlist(
+    model: ObjectModel, estimators: Sequence[str], *, weights: Path | None = None, peers: bool = False
+) -> list[Contender]:
+    """Make the estimators that take part.
+
+    Args:
+        model: the object that they look for.
+        estimators: names of registered ones.
+        weights: of ``dense``, the shipped ones when None.
+        peers: whether those of :mod:`~active6d_bringup.benchmark.peers` take part, too.
+
+    Raises:
+        ValueError: a name is unknown, weights are missing, or the library of a peer is not installed.
+    """
+    contenders = []
+    for name in dict.fromkeys(estimators):
+        if name == "dense":
+            path = weights or weights_path(model.name)
+            estimator = create_estimator(name, model, weights=str(path))
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            contenders.append(Contender(name, f"{name} {digest[:12]}", estimator))
+        else:
+            contenders.append(Contender(name, name, create_estimator(name, model)))
+    if peers:
+        contenders += [Contender(name, name, factory(model)) for name, factory in PEERS.items()]
+    return contenders
 
 
 def measure_estimators(
     object_name: str,
     split: str,
-    estimators: Sequence[str],
+    contenders: Sequence[Contender],
     *,
     sample: int | None = None,
-    moves: int = 5,
+    moves: int = 0,
     seed: int = 0,
-    noise: float = 1.0,
+    noises: Sequence[float] = (1.0,),
+    records: Path | None = None,
     on_progress: OnProgress = lambda what, done, total: None,
-) -> dict[str, Any]:
-    """Run estimators on the same views of stored scenes.
+) -> Measurement:
+    """Run estimators on the same views of stored scenes, each view rendered once.
 
     Args:
         object_name: what is in the bins.
         split: of the stored scenes.
-        estimators: their names.
+        contenders: as from :func:`enlist`.
         sample: number of (scene, view) pairs drawn by ``seed``; None takes every view of every scene.
-        moves: views after the first in one random walk a scene, for what fusion finds; 0 leaves that out.
+        moves: views after the first in one random walk a scene, for what fusion finds at the first of ``noises``; 0
+            leaves that out, as it is left out for peers.
         seed: of the sample, the walks and the sensor's noise.
-        noise: factor on the sensor's noise; 0 switches it off.
+        noises: factors on the sensor's noise; 0 switches it off.
+        records: results of single views go to this file, and are taken from it where it has them.
         on_progress: called with what is being done, and how much of it is done.
 
-    Returns:
-        The table that ``active6d benchmark estimator --json`` writes.
-
     Raises:
-        ValueError: a name or the split is not known.
+        ValueError: the object or the split is not known, or the records are of other measurements.
     """
     if split not in SPLITS:
         raise ValueError(f"unknown split '{split}'; known: {', '.join(SPLITS)}")
     model = load_object(object_name)
-    made = {name: create_estimator(name, model) for name in estimators}
     scenes = [load_scene(object_name, split, index) for index in range(SPLITS[split])]
+    store = Records(records, {"object": object_name, "split": split, "seed": seed})
     rng = np.random.default_rng(seed)
-    grid = len(ViewSphere())
-    pairs = [(scene, view) for scene in range(len(scenes)) for view in range(grid)]
-    if sample is not None and sample < len(pairs):
-        pairs = [pairs[i] for i in sorted(rng.choice(len(pairs), sample, replace=False))]
-    walks = [[(scene, int(view)) for view in rng.permutation(grid)[: moves + 1]] for scene in range(len(scenes))]
-    views = _Views(scenes, seed, noise)
-    results = {}
-    for name, estimator in made.items():
-        drawn = views.of(pairs, partial(on_progress, name))
-        results[name] = summarise(model, evaluate_estimator(estimator, model, drawn))
-        if moves:
-            walked = views.of([pair for walk in walks for pair in walk], partial(on_progress, f"{name}, fused"))
-            episodes = (list(islice(walked, moves + 1)) for _ in walks)
-            results[name]["fused"] = detection_over_views(estimator, model, episodes).mean(axis=0).tolist()
-    return {
+    pairs = _draw_views(rng, len(scenes), sample)
+    views, verifier = GridViews(model, scenes, seed), Verifier(model)
+    tasks = [(*pair, noise, contender) for pair in pairs for noise in noises for contender in contenders]
+    for done, (scene, view, noise, contender) in enumerate(tasks):
+        on_progress(f"{contender.name}, {scenes[scene].name}, view {view}", done, len(tasks))
+        key = (contender.identity, noise, scene, view)
+        if key not in store:
+            labelled = views.capture(scene, view, noise)
+            store.add(key, evaluate_view(contender.estimator, verifier, model, labelled))
+    on_progress("views", len(tasks), len(tasks))
+    results = {
+        (noise, contender.name): EstimatorResult(
+            model.diameter, tuple(store[contender.identity, noise, scene, view] for scene, view in pairs)
+        )
+        for noise in noises
+        for contender in contenders
+    }
+    rows: dict[str, dict[str, Any]] = {f"{noise:g}": {} for noise in noises}
+    for (noise, name), result in results.items():
+        rows[f"{noise:g}"][name] = summarise(model, result, [scene for scene, _ in pairs])
+    walks = [[int(view) for view in rng.permutation(len(ViewSphere()))[: moves + 1]] for _ in scenes]
+    for contender in contenders:
+        if moves and contender.name not in PEERS:
+            on_progress(f"{contender.name}, fused", len(tasks), len(tasks))
+            episodes = ([views.capture(scene, view, noises[0]) for view in walk] for scene, walk in enumerate(walks))
+            fused = detection_over_views(contender.estimator, model, episodes).mean(axis=0)
+            rows[f"{noises[0]:g}"][contender.name]["fused"] = fused.tolist()
+    document = {
         "object": object_name,
         "split": split,
         "views": len(pairs),
         "seed": seed,
-        "noise": noise,
-        "estimators": results,
+        "estimators": {contender.name: contender.identity for contender in contenders},
+        "peak_memory_mib": _peak_memory_mib(),
+        "noise": rows,
     }
+    return Measurement(document, results)
 
 
-def summarise(model: ObjectModel, result: EstimatorResult) -> dict[str, Any]:
-    """Rates by visible fraction, precision and time of one estimator.
-
-    ``precision`` counts ADD-S for an object with a part that can hide (the mug's handle): a view may not tell it.
-    """
-    by = "adds" if model.features else "add"
-    precision = {kind: _mean(right) for kind, right in (("add", result.right_add), ("adds", result.right_adds))}
-    return {
-        **{kind: {str(least): _rate(result, least, kind) for least in VISIBLE} for kind in ("add", "adds")},
-        "precision": precision[by],
-        "precision_add": precision["add"],
-        "precision_adds": precision["adds"],
-        "hypotheses_per_view": len(result.score) / len(result.seconds),
-        "ms_median": 1e3 * float(np.median(result.seconds)),
-    }
+def _draw_views(rng: np.random.Generator, scenes: int, sample: int | None) -> list[tuple[int, int]]:
+    """(scene, view) pairs in order."""
+    pairs = [(scene, view) for scene in range(scenes) for view in range(len(ViewSphere()))]
+    if sample is None or sample >= len(pairs):
+        return pairs
+    return [pairs[i] for i in sorted(rng.choice(len(pairs), sample, replace=False))]
 
 
-def _rate(result: EstimatorResult, least_visible: float, by: str) -> float | None:
-    rate = result.detection_rate(least_visible, by)
-    return rate if np.isfinite(rate) else None
-
-
-def _mean(right: np.ndarray) -> float | None:
-    return float(right.mean()) if len(right) else None
-
-
-class _Views:
-    """Captures views of stored scenes; keeps one scene's simulator at a time, since each holds its triangles."""
-
-    def __init__(self, scenes: list[Scene], seed: int, noise: float) -> None:
-        self._scenes = scenes
-        self._seed = seed
-        self._noise = SensorNoise().scaled(noise)
-        self._current: tuple[int, Simulator] | None = None
-
-    def of(self, pairs: Sequence[tuple[int, int]], on_view: Callable[[int, int], None]) -> Iterator[LabelledView]:
-        """The views of (scene, view) pairs, one by one."""
-        sphere = ViewSphere()
-        for done, (index, number) in enumerate(pairs):
-            on_view(done + 1, len(pairs))
-            if self._current is None or self._current[0] != index:
-                self._current = index, Simulator(self._scenes[index], noise=self._noise, seed=self._seed)
-            scene = self._scenes[index]
-            view = self._current[1].capture(sphere.pose(sphere.positions[number]), (number + 1) * 1_000_000_000)
-            yield LabelledView(view, scene.T_world_object, scene.visible_fraction[number])
+def _peak_memory_mib() -> float:
+    """Of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1024 if sys.platform.startswith("linux") else peak / 1024**2

@@ -15,6 +15,7 @@ from active6d_bringup.cli import (
     benchmark,
     doctor,
     episode,
+    estimator_benchmark,
     evaluate,
     objects,
     policy_training,
@@ -81,6 +82,7 @@ app.command()(evaluate.evaluate)
 app.command()(ablate.ablate)
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
+benchmark.app.command()(estimator_benchmark.estimator)
 benchmark.app.command()(agent_benchmark.environment)
 benchmark.app.command()(agent_benchmark.pipeline)
 app.add_typer(benchmark.app, name="benchmark")
