@@ -145,7 +145,7 @@ class ViewAttention(nn.Module):
         e = (e + self.mix(e)) * present[:, None, :, None]
         logits = self.attend(e)[..., 0].masked_fill(~present[:, None], -1e9)
         attention = torch.softmax(logits, dim=-1) * present[:, None]
-        attended = torch.einsum("bmn,bmnh->bmh", attention, e)
+        attended = (attention[:, :, None] @ e)[:, :, 0]
         # Gains of different objects add up; what nobody has seen yet is for the view as a whole to say.
         gains = (self.per_object(e) * present[:, None, :, None]).sum(dim=2)
         mean = e.sum(dim=2) / count[:, None]
@@ -167,10 +167,10 @@ class ViewAttention(nn.Module):
         rays = rays / distance[..., None].clamp(min=1e-6)
         free, clear = self._sight(rays, centre, present)
         new, old = rays[:, :M], rays[:, M:]
-        turned = torch.einsum("bmik,btik->bmti", new, old)
+        turned = (new.transpose(1, 2) @ old.permute(0, 2, 3, 1)).permute(0, 2, 3, 1)
         closest = turned.amax(dim=2).clamp(-1.0, 1.0)
         seen_there = (free[:, None, M:] * (1.0 + turned) / 2).amax(dim=2)
-        sides = self._sides(torch.einsum("bnij,bmni->bmnj", rotation, new))
+        sides = self._sides((new.transpose(1, 2) @ rotation).transpose(1, 2))
         outward = centre[..., :2] / torch.linalg.vector_norm(centre[..., :2], dim=-1, keepdim=True).clamp(min=1e-6)
         ahead = -torch.nn.functional.normalize(grid, dim=-1)
         columns = [
@@ -191,15 +191,17 @@ class ViewAttention(nn.Module):
     def _sight(self, rays: torch.Tensor, centre: torch.Tensor, present: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """How free (B, K, n, 3) rays from objects to cameras are past the other objects: (B, K, n) twice, once for
         balls with the diameter and once for their cores."""
-        apart = centre[:, None] - centre[:, :, None]
+        apart = (centre[:, None] - centre[:, :, None]) / self.diameter
         square = (apart**2).sum(dim=-1)
-        hides = present[:, None, :] & (square > (_SAME_OBJECT * self.diameter) ** 2)
-        along = torch.einsum("bkid,bijd->bkij", rays, apart)
-        beside = torch.sqrt((square[:, None] - along**2).clamp(min=0.0)) / self.diameter
-        before = hides[:, None] & (along > 0)
-        free = torch.where(before, beside.clamp(max=1.0), 1.0).prod(dim=-1)
-        clear = torch.where(before, (2 * beside).clamp(max=1.0), 1.0).prod(dim=-1)
-        return free, clear
+        hides = present[:, None, :] & (square > _SAME_OBJECT**2)
+        # From here on (B, n, K, n), the object whose sight it is first, so that everything stays contiguous.
+        along = rays.transpose(1, 2) @ apart.transpose(2, 3)
+        # Roots are drawn of the products, which are fewer.
+        beside = torch.addcmul(square[:, :, None], along, along, value=-1.0).clamp(min=0.0)
+        beside = beside.masked_fill(~(hides[:, :, None] & (along > 0)), 1.0)
+        free = beside.clamp(max=1.0).prod(dim=-1).sqrt()
+        clear = (4 * beside).clamp(max=1.0).prod(dim=-1).sqrt()
+        return free.transpose(1, 2), clear.transpose(1, 2)
 
     def _sides(self, directions: torch.Tensor) -> torch.Tensor:
         """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
@@ -235,7 +237,7 @@ class ViewAttention(nn.Module):
     def _describe_views(self, state: dict[str, torch.Tensor], radius: torch.Tensor) -> torch.Tensor:
         grid = torch.nn.functional.normalize(state["views"], dim=-1)
         taken = torch.nn.functional.normalize(state["taken"], dim=-1)
-        arcs = torch.acos((torch.einsum("md,btd->bmt", grid, taken)).clamp(-1, 1) * 0.999999) / np.pi
+        arcs = torch.acos((grid @ taken.transpose(1, 2)).clamp(-1, 1) * 0.999999) / np.pi
         height, level = grid[:, 2].expand(arcs.shape[:2]), taken[:, -1, 2:3].expand(arcs.shape[:2])
         moves = (state["moves"] / 5).clamp(max=2.0)[:, None].expand_as(height)
         left = (state["left"] / 5).clamp(max=2.0)[:, None].expand_as(height)
