@@ -152,7 +152,7 @@ class FeatureMatching:
         self._sparse = _cloud(*model.surface).voxel_down_sample(self._voxel)
         self._features = self._describe(self._sparse)
         self._criteria = _REGISTRATION.RANSACConvergenceCriteria(iterations, 0.999)
-        self._icp = VisibleIcp(model, self._voxel / 2, gates=(0.012, 0.006))
+        self._icp = VisibleIcp(model, 0.03 * model.diameter)
         self._check = DepthCheck(model)
 
     def estimate(self, view: View) -> Hypotheses:
