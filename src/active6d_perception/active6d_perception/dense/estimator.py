@@ -35,6 +35,8 @@ from active6d_perception.symmetric_distance import SymmetricDistance
 
 # Turns this close to the chosen one count as the same answer when its certainty is told.
 _SAME_TURN = np.radians(30.0)
+# Turns of an instance that are refined, where its whole surface tells which is right.
+_TRIED_TURNS = 6
 # A further turn of an instance is reported only if it is at least this likely.
 _LEAST_CERTAINTY = 0.2
 # Exponent of what the network says about the turn, beside what the depth image says.
@@ -191,8 +193,10 @@ class DenseEstimator:
     def _find_poses(self, instances: Instances, surface: MeasuredSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(k, 4, 4) refined ``T_camera_object``, and (k,) instance and certainty of each; likely turns first."""
         gauge, T = self._trained.gauge, instances.T_camera_axis
-        if self._turns is None:
+        if gauge.turn is Turn.INVISIBLE:
             return self._refined(gauge.object_pose(T), surface, _GATES), np.arange(len(T)), np.ones(len(T))
+        if self._turns is None:
+            return self._best_fitting_turns(instances, surface)
         # The network's guess of the turn serves to put the axis right, and that to find the turn.
         probability = turn_probability(T, instances.direction)
         T = T @ turn_about_z(TURNS[probability.argmax(axis=1)])
@@ -201,6 +205,19 @@ class DenseEstimator:
         instance, rank = np.nonzero((np.arange(chosen.shape[1]) == 0) | (certainty > _LEAST_CERTAINTY))
         T = gauge.object_pose(T[instance] @ turn_about_z(TURNS[chosen[instance, rank]]))
         return self._refined(T, surface, _GATES[1:]), instance, certainty[instance, rank]
+
+    def _best_fitting_turns(
+        self, instances: Instances, surface: MeasuredSurface
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As :meth:`_find_poses`, where the whole surface shows the turn: of the likely turns that which fits best."""
+        T, count = instances.T_camera_axis, len(instances)
+        turns, _ = likely_turns(turn_probability(T, instances.direction), _TRIED_TURNS)
+        tried = self._trained.gauge.object_pose(T[:, None] @ turn_about_z(TURNS[turns])).reshape(-1, 4, 4)
+        tried = self._refined(tried, surface, _GATES[:1])
+        fit = self._fit(tried, surface).reshape(turns.shape)
+        best = np.arange(count) * _TRIED_TURNS + fit.argmax(axis=1)
+        T = self._refined(tried[best], surface, _GATES[1:])
+        return T, np.arange(count), np.ones(count)
 
     def _turn_probability(self, T: np.ndarray, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
         """(n, len(TURNS)) by network and depth together."""
@@ -213,12 +230,16 @@ class DenseEstimator:
             return T
         return refine(self._views, T, surface.tree, surface.tree_normals, gates=gates, iterations=_ITERATIONS)
 
+    def _fit(self, T_camera_object: np.ndarray, surface: MeasuredSurface) -> np.ndarray:
+        """(k,) share of each pose's visible surface that is measured there, less what the camera looked through."""
+        evidence = weigh_evidence(self._views, T_camera_object, surface.depth, surface.normals, surface.camera)
+        return evidence.fitting - evidence.violated
+
     def _judge(
         self, T_camera_object: np.ndarray, instance: np.ndarray, certainty: np.ndarray, surface: MeasuredSurface
     ) -> tuple[Poses, np.ndarray]:
-        evidence = weigh_evidence(self._views, T_camera_object, surface.depth, surface.normals, surface.camera)
         slope, offset = _PRESENCE
-        presence = expit(slope * (evidence.fitting - evidence.violated) + offset)
+        presence = expit(slope * self._fit(T_camera_object, surface) + offset)
         return self._report(Poses(T_camera_object, presence * certainty, instance, certainty), surface)
 
     def _report(self, poses: Poses, surface: MeasuredSurface) -> tuple[Poses, np.ndarray]:
