@@ -34,7 +34,7 @@ def draw_verification(path: Path, title: str, result: EstimatorResult) -> None:
                 ".",
                 color=color,
                 alpha=_alpha(len(score)),
-                markersize=4,
+                markersize=6,
                 markeredgewidth=0,
                 label=f"{name} ({chosen.sum()})",
             )
@@ -72,7 +72,7 @@ def draw_ambiguity(path: Path, title: str, model: ObjectModel, result: Estimator
                 ".",
                 color=color,
                 alpha=_alpha(len(found.rotation)),
-                markersize=5,
+                markersize=6,
                 markeredgewidth=0,
             )
         share = f", {right.sum() / chosen.sum():.0%} turned right" if chosen.any() else ""

@@ -60,9 +60,10 @@ def estimator(
             records=records,
             on_progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
         )
+    part = " or ".join(model.features)
     for factor, rows in measured.document["noise"].items():
         title = f"{object_name}, {split}, {measured.document['views']} views, noise x{factor}"
-        for table in (_rates(title, rows), _details(rows)):
+        for table in (_rates(title, rows, part), _details(rows, part)):
             console.print(table)
             console.print()
     console.print(f"peak memory of the process {measured.document['peak_memory_mib']:.0f} MiB", highlight=False)
@@ -76,10 +77,10 @@ def estimator(
         messages.print(f"wrote {plots}/*_{ending}", highlight=False)
 
 
-def _rates(title: str, rows: dict[str, dict[str, Any]]) -> Table:
-    """Shares found by visible fraction with their 95 % intervals, and precision; a row an estimator."""
+def _rates(title: str, rows: dict[str, dict[str, Any]], part: str) -> Table:
+    """Shares found by visible fraction with their 95 % intervals, and precision; ``part`` is what tells the turn."""
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    table.add_column("detection at 10 %", header_style="dim")
+    table.add_column("detection at 10 %", header_style="dim", no_wrap=True)
     for column in ("e_ADD ≥half", "≥tenth", "ADD-S ≥half", "≥tenth", "precision"):
         table.add_column(column, justify="right", header_style="dim")
     for name, row in rows.items():
@@ -88,14 +89,14 @@ def _rates(title: str, rows: dict[str, dict[str, Any]]) -> Table:
         if "feature_seen" in row:
             seen = row["feature_seen"]
             cells = [_interval(seen[kind][least]) for kind in ("add", "adds") for least in ("0.5", "0.1")]
-            table.add_row("  its part seen", *cells, "")
+            table.add_row(f"  {part} seen", *cells, "")
     return table
 
 
-def _details(rows: dict[str, dict[str, Any]]) -> Table:
+def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
     """BOP's recalls and precisions, what the scores tell, times; a column an estimator."""
     table = Table(box=None, pad_edge=False)
-    table.add_column("")
+    table.add_column("", no_wrap=True)
     for name in rows:
         table.add_column(name, justify="right", header_style="dim")
 
@@ -111,7 +112,7 @@ def _details(rows: dict[str, dict[str, Any]]) -> Table:
             add(f"{label}, {text}", lambda row, kind=kind, measure=measure: _number(row["verification"][kind][measure]))
     if all("ambiguity" in row for row in rows.values()):
         for where in ("seen", "hidden"):
-            add(f"right turn, part {where}", lambda row, where=where: _number(row["ambiguity"][where]["right_turn"]))
+            add(f"right turn, {part} {where}", lambda row, where=where: _number(row["ambiguity"][where]["right_turn"]))
         add("right from wrong turn, area under the curve", lambda row: _number(row["ambiguity"]["auc"]))
     _add_times(add, rows)
     if any("fused" in row for row in rows.values()):
