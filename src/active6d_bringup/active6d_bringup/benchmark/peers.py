@@ -97,7 +97,7 @@ class PointPairFeatures:
     """OpenCV contrib's ``ppf_match_3d`` (Drost et al. 2010), ICP on its best clusters of votes."""
 
     def __init__(
-        self, model: ObjectModel, *, sampling: float = 0.1, scene_step: float = 1.0, refined: int = 120
+        self, model: ObjectModel, *, sampling: float = 0.09, scene_step: float = 0.5, refined: int = 150
     ) -> None:
         """
         Args:
