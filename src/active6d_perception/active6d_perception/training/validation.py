@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from active6d_core.metrics import DETECTION_FRACTION, add_s, e_add, match
 from active6d_core.object_model import ObjectModel
-from active6d_perception.dense.estimator import DenseEstimator
+from active6d_perception.dense.estimator import DenseEstimator, DenseParameters
 from active6d_perception.dense.gauge import Turn
 from active6d_perception.dense.weights_file import TrainedNetwork
 from active6d_perception.training.batches import input_tensor
@@ -21,14 +21,30 @@ _VISIBLE = {"half": 0.5, "tenth": 0.1}
 
 
 def validate(model: ObjectModel, trained: TrainedNetwork, samples: Sequence[Sample]) -> dict[str, float]:
+    """:func:`pose_rates` of a network, and ``loss_<term>`` without augmentation."""
+    return {**pose_rates(model, trained, samples), **_losses(model, trained, samples)}
+
+
+def pose_rates(
+    model: ObjectModel,
+    trained: TrainedNetwork,
+    samples: Sequence[Sample],
+    parameters: DenseParameters = DenseParameters(),
+) -> dict[str, float]:
     """Rates in [0, 1] over all views together.
+
+    Args:
+        model: the object.
+        trained: its network.
+        samples: views with truth.
+        parameters: of the estimator around the network.
 
     Returns:
         ``add_half``, ``add_tenth``: objects at least half or a tenth visible that are detected (e_ADD below 10 % of the
         diameter); ``adds_half``, ``adds_tenth``: the same by ADD-S; ``precision``: hypotheses that are right, by
-        ADD-S where only a part of the object shows its turn; and ``loss_<term>`` without augmentation.
+        ADD-S where only a part of the object shows its turn.
     """
-    estimator = DenseEstimator(model, trained)
+    estimator = DenseEstimator(model, trained, parameters)
     limit = DETECTION_FRACTION * model.diameter
     found, visible, right, reported = {"add": [], "adds": []}, [], 0, 0
     for sample in samples:
@@ -49,7 +65,7 @@ def validate(model: ObjectModel, trained: TrainedNetwork, samples: Sequence[Samp
         for name in found
         for what, least in _VISIBLE.items()
     }
-    return {**rates, "precision": float(right / max(reported, 1)), **_losses(model, trained, samples)}
+    return {**rates, "precision": float(right / max(reported, 1))}
 
 
 def _near_add_s(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, limit: float) -> np.ndarray:
