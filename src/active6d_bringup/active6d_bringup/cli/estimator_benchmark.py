@@ -138,7 +138,9 @@ def _number(value: float | None) -> str:
 
 
 def _interval(rate: dict[str, Any]) -> str:
-    return "-" if rate["rate"] is None else f"{rate['rate']:.3f} ({rate['low']:.2f}-{rate['high']:.2f})"
+    if rate["rate"] is None:
+        return "-"
+    return f"{rate['rate']:.3f}\n[dim]{rate['low']:.2f}-{rate['high']:.2f}[/dim]"  # narrow enough for 80 columns
 
 
 def _time(times: dict[str, Any], key: str) -> str:
