@@ -312,6 +312,44 @@ def test_a_handle_may_be_behind_what_hides_it_and_not_where_the_camera_looked_th
     assert probability[true_side].sum() > 30 * probability[other_side].sum()
 
 
+def test_a_network_with_the_wrong_owner_does_not_hide_the_handle():
+    # All pixels off the body went to a neighbour; they are still nobody else's body.
+    model, gauge = load_object("mug"), gauge_of(load_object("mug"))
+    T_camera_axis = upright_mug(90)
+    depth, camera = mug_alone(gauge.object_pose(T_camera_axis[None])[0])
+    points = backproject(depth, camera)
+    local = transform_points(invert(T_camera_axis), points)
+    handle = (depth < 1.5) & (np.hypot(local[..., 0], local[..., 1]) > 0.046)
+    assert handle.sum() > 40
+    owner = np.where(handle, 1, np.where(depth < 1.5, 0, -1))
+    surface = MeasuredSurface(
+        depth, points, normals_from_points(points, reach=1), owner, camera, None, np.zeros((0, 3))
+    )
+    elsewhere = T_camera_axis.copy()
+    elsewhere[0, 3] += 0.3
+    found = TurnSearch(model, gauge).log_likelihood(np.stack([T_camera_axis, elsewhere]), surface)[0]
+    assert np.degrees(abs((TURNS[found.argmax()] + np.pi) % (2 * np.pi) - np.pi)) < 10
+    assert likely_turns(softmax(found)[None], 1)[1] > 0.9
+
+
+def test_turns_of_many_mugs_are_those_of_each_alone():
+    model, gauge = load_object("mug"), gauge_of(load_object("mug"))
+    T_camera_axis = np.stack([upright_mug(90), upright_mug(-60) @ turn_about_z(1.0)])
+    depth, camera = mug_alone(gauge.object_pose(T_camera_axis[:1])[0])
+    points = backproject(depth, camera)
+    owner = np.where(depth < 1.5, 0, -1)
+    surface = MeasuredSurface(
+        depth, points, normals_from_points(points, reach=1), owner, camera, None, np.zeros((0, 3))
+    )
+    search = TurnSearch(model, gauge)
+    together = search.log_likelihood(T_camera_axis, surface)
+    assert np.allclose(together[0], search.log_likelihood(T_camera_axis[:1], surface)[0])
+    # Starting from another turn shifts the answer and changes nothing else.
+    step = 2 * np.pi / len(TURNS)
+    shifted = search.log_likelihood(T_camera_axis[:1] @ turn_about_z(7 * step), surface)[0]
+    assert np.allclose(np.roll(shifted, 7), together[0], atol=1.5)
+
+
 def test_likely_turns_lie_apart():
     probability = np.exp(-(np.minimum(TURNS, 2 * np.pi - TURNS) ** 2) * 20)
     probability += 0.5 * np.roll(probability, 30)

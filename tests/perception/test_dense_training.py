@@ -157,9 +157,20 @@ def test_a_hidden_handle_is_told():
         seen = np.isin(true, [1, 3])
         assert errors[seen, true[seen]].max() < 0.03 * model.diameter
         assert poses.certainty[seen].min() > 0.95
+        # All four are there; the score is how sure that is, times how sure the turn.
+        presence = poses.score / poses.certainty
+        assert ((presence > 0.95) & (presence <= 1)).all()
         if not network_knows:
             assert poses.certainty[~seen].max() < 0.9
             assert poses.score[seen].min() > poses.score[~seen].max()
+            several = DenseEstimator(model, estimator._trained, DenseParameters(alternatives=3))
+            several.ask = estimator.ask
+            more, label = several.locate(sample.view)
+            assert len(more.score) > 4
+            assert sorted(set(more.instance)) == [0, 1, 2, 3]
+            assert label.max() == 4
+            # Further turns of one instance share its centre; their certainties add up to one at most.
+            assert (np.bincount(more.instance, more.certainty) <= 1 + 1e-9).all()
 
 
 def test_shards_come_back(tmp_path, mug_view):

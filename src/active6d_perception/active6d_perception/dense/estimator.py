@@ -38,7 +38,7 @@ _SAME_TURN = np.radians(30.0)
 # Turns of an instance that are refined, where its whole surface tells which is right.
 _TRIED_TURNS = 6
 # A further turn of an instance is reported only if it is at least this likely.
-_LEAST_CERTAINTY = 0.2
+_LEAST_CERTAINTY = 0.1
 # Exponent of what the network says about the turn, beside what the depth image says.
 _NETWORK_TRUST = 0.6
 _GATES = (0.008, 0.004)  # metres, of refinement
@@ -47,7 +47,7 @@ _ITERATIONS = 3  # of refinement with each gate; more change nothing on the vali
 # should be, less what was looked through: slope, and offset by what a turn does. The best of several tried turns fits
 # somewhat even where all are wrong. Fitted on the validation views of cup, mug and bunny.
 _PRESENCE_SLOPE = 14.0
-_PRESENCE_OFFSET = {Turn.VISIBLE: -2.5, Turn.TOLD_BY_FEATURE: -0.8, Turn.INVISIBLE: -0.8}
+_PRESENCE_OFFSET = {Turn.VISIBLE: -1.8, Turn.TOLD_BY_FEATURE: -0.8, Turn.INVISIBLE: -0.8}
 
 
 @dataclass(frozen=True)
