@@ -84,7 +84,7 @@ def decode(
     label, pixel, points = clusters.label[member], pixel[member], points[member]
     parts = {name: part[member] for name, part in parts.items()}
     count = len(clusters.centre)
-    table, used = _member_table(label, count, parameters.pixels)
+    table, used = member_table(label, count, parameters.pixels)
     R_camera_ray = ray_rotation(clusters.centre)
     direction = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
     T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
@@ -142,8 +142,8 @@ def _robust_mean(values: np.ndarray, weight: np.ndarray, scale: float) -> np.nda
     return mean
 
 
-def _member_table(label: np.ndarray, count: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """(count, most) positions of at most that many members of each label, evenly taken, and which entries are used."""
+def member_table(label: np.ndarray, count: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most ``most`` members of each label, evenly taken: (count, most) positions, and which entries are used."""
     order = np.argsort(label, kind="stable")
     size = np.bincount(label, minlength=count)
     start = np.cumsum(size) - size
@@ -151,7 +151,8 @@ def _member_table(label: np.ndarray, count: int, most: int) -> tuple[np.ndarray,
     column = np.arange(most)
     rank = column * size[:, None] // np.maximum(taken, 1)[:, None]
     used = column < taken[:, None]
-    return order[np.where(used, start[:, None] + rank, start[:, None])] if count else np.zeros((0, most), int), used
+    position = np.where(used, start[:, None] + rank, 0)
+    return (order[position] if len(order) else position), used
 
 
 def _mean(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:

@@ -25,6 +25,7 @@ from active6d_perception.dense.network_input import (
     reduce_view,
     reduction,
 )
+from active6d_perception.dense.orientation_search import OrientationSearch
 from active6d_perception.dense.surface import MeasuredSurface
 from active6d_perception.dense.turns import TurnSearch
 from active6d_perception.dense.weights_file import TrainedNetwork, load_network
@@ -35,14 +36,16 @@ from active6d_perception.symmetric_distance import SymmetricDistance
 
 # Turns this close to the chosen one count as the same answer when its certainty is told.
 _SAME_TURN = np.radians(30.0)
-# Turns of an instance that are refined, where its whole surface tells which is right.
-_TRIED_TURNS = 6
+# Orientations of an instance that are refined, where its whole surface tells which is right, and how far off they are.
+_TRIED_ORIENTATIONS = 12
+_SEARCH_GATES = (0.02, 0.012, 0.008)  # metres; votes for centres of slivers are 20 mm off
 # A further turn of an instance is reported only if it is at least this likely.
 _LEAST_CERTAINTY = 0.1
 # Exponent of what the network says about the turn, beside what the depth image says.
 _NETWORK_TRUST = 0.6
 _GATES = (0.008, 0.004)  # metres, of refinement
 _ITERATIONS = 3  # of refinement with each gate; more change nothing on the validation views
+_SAMPLES = 192  # of the model's surface, in refinement
 # Logistic regression of whether a pose's body is right, on the share of its visible surface that is measured where it
 # should be, less what was looked through: slope, and offset by what a turn does. The best of several tried turns fits
 # somewhat even where all are wrong. Fitted on the validation views of cup, mug and bunny.
@@ -135,8 +138,8 @@ class DenseEstimator:
         self._network = fused(trained.network).to(dtype=self._precision, memory_format=torch.channels_last)
         self._views = model_views(model)
         self._distance = SymmetricDistance(model)
-        told_by_feature = trained.gauge.turn is Turn.TOLD_BY_FEATURE
-        self._turns = TurnSearch(model, trained.gauge) if told_by_feature else None
+        self._turns = TurnSearch(model, trained.gauge) if trained.gauge.turn is Turn.TOLD_BY_FEATURE else None
+        self._orientations = OrientationSearch(model) if trained.gauge.turn is Turn.VISIBLE else None
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimator.Estimator.estimate`."""
@@ -197,8 +200,8 @@ class DenseEstimator:
         gauge, T = self._trained.gauge, instances.T_camera_axis
         if gauge.turn is Turn.INVISIBLE:
             return self._refined(gauge.object_pose(T), surface, _GATES), np.arange(len(T)), np.ones(len(T))
-        if self._turns is None:
-            return self._best_fitting_turns(instances, surface)
+        if gauge.turn is Turn.VISIBLE:
+            return self._best_fitting_orientations(instances, surface)
         # The network's guess of the turn serves to put the axis right, and that to find the turn.
         probability = turn_probability(T, instances.direction)
         T = T @ turn_about_z(TURNS[probability.argmax(axis=1)])
@@ -208,18 +211,16 @@ class DenseEstimator:
         T = gauge.object_pose(T[instance] @ turn_about_z(TURNS[chosen[instance, rank]]))
         return self._refined(T, surface, _GATES[1:]), instance, certainty[instance, rank]
 
-    def _best_fitting_turns(
+    def _best_fitting_orientations(
         self, instances: Instances, surface: MeasuredSurface
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As :meth:`_find_poses`, where the whole surface shows the turn: of the likely turns that which fits best."""
-        T, count = instances.T_camera_axis, len(instances)
-        turns, _ = likely_turns(turn_probability(T, instances.direction), _TRIED_TURNS)
-        tried = self._trained.gauge.object_pose(T[:, None] @ turn_about_z(TURNS[turns])).reshape(-1, 4, 4)
-        tried = self._refined(tried, surface, _GATES[:1])
-        fit = self._fit(tried, surface).reshape(turns.shape)
-        best = np.arange(count) * _TRIED_TURNS + fit.argmax(axis=1)
-        T = self._refined(tried[best], surface, _GATES[1:])
-        return T, np.arange(count), np.ones(count)
+        """As :meth:`_find_poses`, where the surface shows the orientation in full: of several that which fits best."""
+        count = len(instances)
+        tried = self._orientations.candidates(instances, surface, _TRIED_ORIENTATIONS).reshape(-1, 4, 4)
+        tried = self._refined(tried, surface, _SEARCH_GATES, iterations=2, samples=64)
+        fit = self._fit(tried, surface).reshape(count, _TRIED_ORIENTATIONS)
+        best = np.arange(count) * _TRIED_ORIENTATIONS + fit.argmax(axis=1)
+        return self._refined(tried[best], surface, _GATES[1:]), np.arange(count), np.ones(count)
 
     def _turn_probability(self, T: np.ndarray, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
         """(n, len(TURNS)) by network and depth together."""
@@ -227,10 +228,19 @@ class DenseEstimator:
         told = _NETWORK_TRUST * np.log(turn_probability(T, instances.direction) + 1e-6)
         return softmax(measured + told, axis=1)
 
-    def _refined(self, T: np.ndarray, surface: MeasuredSurface, gates: tuple[float, ...]) -> np.ndarray:
+    def _refined(
+        self,
+        T: np.ndarray,
+        surface: MeasuredSurface,
+        gates: tuple[float, ...],
+        iterations: int = _ITERATIONS,
+        samples: int = _SAMPLES,
+    ) -> np.ndarray:
         if not self.parameters.refined or surface.tree is None:
             return T
-        return refine(self._views, T, surface.tree, surface.tree_normals, gates=gates, iterations=_ITERATIONS)
+        return refine(
+            self._views, T, surface.tree, surface.tree_normals, gates=gates, iterations=iterations, samples=samples
+        )
 
     def _fit(self, T_camera_object: np.ndarray, surface: MeasuredSurface) -> np.ndarray:
         """(k,) share of each pose's visible surface that is measured there, less what the camera looked through."""

@@ -20,7 +20,7 @@ from active6d_perception.model_views import model_views
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 axes, 18 degrees apart
 _TURNS = 24
-_TRIED = 1200  # orientations per instance, the likeliest by the network
+_TRIED = 1000  # orientations per instance, the likeliest by the network
 _POINTS = 48  # per instance
 _CELL = 0.02  # diameters, of the grid of distances
 _REACH = 0.1  # diameters: a point farther from the surface than this does not fit at all
@@ -49,37 +49,52 @@ class OrientationSearch:
         self._normals = np.append(views.normals, np.zeros((1, 3), np.float32), axis=0)[nearest]
 
     def candidates(self, instances: Instances, surface: MeasuredSurface, count: int) -> np.ndarray:
-        """(n, count, 4, 4) ``T_camera_object`` with the voted centres, best first, none near another of its instance."""
+        """The orientations that fit best, with the voted centres.
+
+        Args:
+            instances: as decoded; their axis frame is the object's.
+            surface: as measured.
+            count: orientations per instance.
+
+        Returns:
+            (n, count, 4, 4) ``T_camera_object``, best first, those of one instance at least 25 degrees apart.
+        """
         centre = instances.T_camera_axis[:, :3, 3]
+        # All in the frame of the ray through the instance's centre, as the network's answer is.
         R_camera_ray = ray_rotation(centre)
         axis = np.einsum("nij,ni->nj", R_camera_ray, instances.T_camera_axis[:, :3, 2])
-        # The grid is in the frame of the ray through the instance's centre, as the network's answer is.
         told = np.log(instances.direction @ self._bins.T + 1e-3) + _AXIS_TRUST * axis @ self._R[:, :, 2].T
         tried = np.argpartition(-told, _TRIED, axis=1)[:, :_TRIED]
         told = np.take_along_axis(told, tried, axis=1)
         R = self._R[tried]
-        fit = self._fit(R, R_camera_ray, centre, instances, surface) + _NETWORK_TRUST * (told - told.max(axis=1)[:, None])
-        best = np.zeros((len(instances), count), np.intp)
-        rows = np.arange(len(instances))
+        worth = self._fit(R, R_camera_ray, centre, instances, surface) + _NETWORK_TRUST * told
+        rows, best = np.arange(len(instances)), np.zeros((len(instances), count), np.intp)
         for rank in range(count):
-            best[:, rank] = fit.argmax(axis=1)
+            best[:, rank] = worth.argmax(axis=1)
             cosine = (np.einsum("nkij,nij->nk", R, R[rows, best[:, rank]]) - 1) / 2
-            fit = np.where(cosine > np.cos(_APART), -np.inf, fit)
+            worth = np.where(cosine > np.cos(_APART), -np.inf, worth)
         chosen = R_camera_ray[:, None] @ R[rows[:, None], best]
         return make_transform(chosen, np.broadcast_to(centre[:, None], (*best.shape, 3)))
 
-    def _fit(self, R, R_camera_ray, centre, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
+    def _fit(
+        self,
+        R_ray_object: np.ndarray,
+        R_camera_ray: np.ndarray,
+        centre: np.ndarray,
+        instances: Instances,
+        surface: MeasuredSurface,
+    ) -> np.ndarray:
         """(n, k) mean over an instance's points of how near and how alike the model's surface is, in [0, 1]."""
-        pixel = np.flatnonzero((surface.owner.ravel() >= 0) & np.isfinite(surface.normals.reshape(-1, 3)).all(axis=1))
+        normals = surface.normals.reshape(-1, 3)
+        pixel = np.flatnonzero((surface.owner.ravel() >= 0) & np.isfinite(normals).all(axis=1))
         table, used = member_table(surface.owner.ravel()[pixel], len(instances), _POINTS)
-        pixel = pixel[table] if len(pixel) else np.zeros(table.shape, np.intp)
-        points = (surface.points.reshape(-1, 3)[pixel] - centre[:, None]) @ R_camera_ray
-        normals = surface.normals.reshape(-1, 3)[pixel] @ R_camera_ray
-        local = points.astype(np.float32)[:, None] @ R
-        cell = np.rint(local / self._cell).astype(np.int32) + self._half
+        pixel = pixel[table] if len(pixel) else table
+        points = ((surface.points.reshape(-1, 3)[pixel] - centre[:, None]) @ R_camera_ray).astype(np.float32)
+        normals = (np.nan_to_num(normals[pixel]) @ R_camera_ray).astype(np.float32)
+        cell = np.rint(points[:, None] @ R_ray_object / self._cell).astype(np.int32) + self._half
         inside = ((cell >= 0) & (cell < self._shape)).all(axis=-1) & used[:, None]
         flat = np.where(inside, np.ravel_multi_index(np.moveaxis(cell, -1, 0), self._shape, mode="clip"), 0)
-        alike = np.einsum("nkpi,nkpi->nkp", normals.astype(np.float32)[:, None] @ R, self._normals[flat])
+        alike = np.einsum("nkpi,nkpi->nkp", normals[:, None] @ R_ray_object, self._normals[flat])
         fit = np.where(inside, self._nearness[flat] * np.maximum(alike, 0), 0)
         return fit.sum(axis=2) / np.maximum(used.sum(axis=1), 1)[:, None]
 
