@@ -18,7 +18,7 @@ _EDGES = np.array([-0.012, -0.006, 0.006, 0.012, np.inf], np.float32)  # metres 
 _ALIKE = 0.6  # cosine between normals
 # Log-likelihood ratios of what is found where the part would be seen, between the right turn and wrong ones. Columns:
 # the pixel is the instance's and not on its body, another's and not on that one's body, nobody's, on its owner's body.
-# Measured on training views, with a network's poses as far as their axes were right.
+# Counted by scripts/measure_turn_evidence.py on training views, with a network's poses where their axes were right.
 _RATIO = np.array(
     [
         [-1.6, -1.2, -2.6, -3.2],  # the camera looked through
@@ -65,7 +65,21 @@ class TurnSearch:
         Returns:
             (n, len(TURNS)).
         """
-        camera, shape = surface.camera, (len(T_camera_axis), len(TURNS))
+        instance, turn, case, pixels = self.cases(T_camera_axis, surface)
+        shape = len(T_camera_axis), len(TURNS)
+        value = _INDEPENDENT * _RATIO.ravel()[case] * pixels
+        return np.bincount(instance * shape[1] + turn, value, minlength=shape[0] * shape[1]).reshape(shape)
+
+    def cases(
+        self, T_camera_axis: np.ndarray, surface: MeasuredSurface
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """What is measured where the part's samples would be seen; arguments as for :meth:`log_likelihood`.
+
+        Returns:
+            of p samples in sight (p,) index of the instance, of the turn, of the case (row * 4 + column of the ratios),
+            and how many pixels the sample stands for.
+        """
+        camera = surface.camera
         instance, turn, sample = np.nonzero(self._visible[self._seen_from(T_camera_axis)])
         R, t = T_camera_axis[:, :3, :3].astype(np.float32), T_camera_axis[:, :3, 3].astype(np.float32)
         points = np.einsum("pij,pj->pi", R[instance], self._points[turn, sample]) + t[instance]
@@ -82,10 +96,8 @@ class TurnSearch:
         whose = np.where(owner < 0, 2, np.where(self._on_body(T_camera_axis, surface)[pixel], 3, owner != instance))
         # Pixels that a sample covers: a slanted one covers fewer.
         slant = np.abs(np.einsum("pi,pi->p", facing, points)) / np.linalg.norm(points, axis=1)
-        weight = _INDEPENDENT * self._area * slant * camera.fx * camera.fy / z**2
-        return np.bincount(
-            instance * shape[1] + turn, _RATIO[found, whose] * weight, minlength=shape[0] * shape[1]
-        ).reshape(shape)
+        pixels = self._area * slant * camera.fx * camera.fy / z**2
+        return instance, turn, found * _RATIO.shape[1] + whose, pixels
 
     def _seen_from(self, T_camera_axis: np.ndarray) -> np.ndarray:
         """(n, turns) index of the model's view direction nearest to the camera's, at each turn."""
