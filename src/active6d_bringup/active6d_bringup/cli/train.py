@@ -21,9 +21,9 @@ _DATA = "Folder for training views and the training's state; by default active6d
 def estimator(
     object_name: ObjectName,
     data: Annotated[Path | None, typer.Option(metavar="DIR", help=_DATA)] = None,
-    heaps: Annotated[int, typer.Option(help="Heaps to render views of.", min=1)] = 150,
+    heaps: Annotated[int, typer.Option(help="Heaps to render views of.", min=1)] = 110,
     views: Annotated[int, typer.Option(help="Views per heap.", min=1)] = 32,
-    steps: Annotated[int, typer.Option(help="Steps of the optimiser in all.", min=1)] = 12_000,
+    steps: Annotated[int, typer.Option(help="Steps of the optimiser in all.", min=1)] = 5_500,
     batch: Annotated[int, typer.Option(help="Views per step.", min=1)] = 8,
     run: Annotated[str, typer.Option(help="Name of the training; an interrupted one of that name goes on.")] = "run",
     export: Annotated[

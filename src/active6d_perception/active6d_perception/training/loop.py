@@ -47,7 +47,7 @@ class TrainingOptions:
         ValueError: a number is out of range.
     """
 
-    steps: int = 12_000
+    steps: int = 5_500
     batch: int = 8
     learning_rate: float = 2e-3
     warmup: int = 300
