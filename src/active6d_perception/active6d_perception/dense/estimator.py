@@ -36,9 +36,9 @@ from active6d_perception.symmetric_distance import SymmetricDistance
 
 # Turns this close to the chosen one count as the same answer when its certainty is told.
 _SAME_TURN = np.radians(30.0)
-# Orientations of an instance that are refined, where its whole surface tells which is right, and how far off they are.
-_TRIED_ORIENTATIONS = 12
-_SEARCH_GATES = (0.02, 0.012, 0.008)  # metres; votes for centres of slivers are 20 mm off
+# Where an instance's whole surface tells which orientation is right: how many are refined, with which gates; of those
+# that fit best fewer, with smaller gates.
+_TRIED_ORIENTATIONS = ((20, (0.02,)), (12, (0.012, 0.008)))  # metres; votes for centres of slivers are 20 mm off
 # A further turn of an instance is reported only if it is at least this likely.
 _LEAST_CERTAINTY = 0.1
 # Exponent of what the network says about the turn, beside what the depth image says.
@@ -50,7 +50,7 @@ _SAMPLES = 192  # of the model's surface, in refinement
 # should be, less what was looked through: slope, and offset by what a turn does. The best of several tried turns fits
 # somewhat even where all are wrong. Fitted on the validation views of cup, mug and bunny.
 _PRESENCE_SLOPE = 14.0
-_PRESENCE_OFFSET = {Turn.VISIBLE: -1.8, Turn.TOLD_BY_FEATURE: -0.8, Turn.INVISIBLE: -0.8}
+_PRESENCE_OFFSET = {Turn.VISIBLE: -1.2, Turn.TOLD_BY_FEATURE: -0.8, Turn.INVISIBLE: -0.8}
 
 
 @dataclass(frozen=True)
@@ -216,11 +216,13 @@ class DenseEstimator:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As :meth:`_find_poses`, where the surface shows the orientation in full: of several that which fits best."""
         count = len(instances)
-        tried = self._orientations.candidates(instances, surface, _TRIED_ORIENTATIONS).reshape(-1, 4, 4)
-        tried = self._refined(tried, surface, _SEARCH_GATES, iterations=2, samples=64)
-        fit = self._fit(tried, surface).reshape(count, _TRIED_ORIENTATIONS)
-        best = np.arange(count) * _TRIED_ORIENTATIONS + fit.argmax(axis=1)
-        return self._refined(tried[best], surface, _GATES[1:]), np.arange(count), np.ones(count)
+        T = self._orientations.candidates(instances, surface, _TRIED_ORIENTATIONS[0][0])
+        for number, gates in _TRIED_ORIENTATIONS:
+            T = self._refined(T[:, :number].reshape(-1, 4, 4), surface, gates, iterations=2, samples=64)
+            fit = self._fit(T, surface).reshape(count, number)
+            best_first = np.argsort(-fit, axis=1, kind="stable")
+            T = np.take_along_axis(T.reshape(count, number, 4, 4), best_first[..., None, None], axis=1)
+        return self._refined(T[:, 0], surface, _GATES[1:]), np.arange(count), np.ones(count)
 
     def _turn_probability(self, T: np.ndarray, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
         """(n, len(TURNS)) by network and depth together."""

@@ -20,8 +20,9 @@ from active6d_perception.model_views import model_views
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 axes, 18 degrees apart
 _TURNS = 24
-_TRIED = 1000  # orientations per instance, the likeliest by the network
-_POINTS = 48  # per instance
+# Orientations per instance, and its points that each is tried on: the likeliest by the network on few, of those the
+# best on more.
+_ROUNDS = ((2000, 24), (500, 64))
 _CELL = 0.02  # diameters, of the grid of distances
 _REACH = 0.1  # diameters: a point farther from the surface than this does not fit at all
 _APART = np.radians(25.0)
@@ -64,10 +65,13 @@ class OrientationSearch:
         R_camera_ray = ray_rotation(centre)
         axis = np.einsum("nij,ni->nj", R_camera_ray, instances.T_camera_axis[:, :3, 2])
         told = np.log(instances.direction @ self._bins.T + 1e-3) + _AXIS_TRUST * axis @ self._R[:, :, 2].T
-        tried = np.argpartition(-told, _TRIED, axis=1)[:, :_TRIED]
-        told = np.take_along_axis(told, tried, axis=1)
-        R = self._R[tried]
-        worth = self._fit(R, R_camera_ray, centre, instances, surface) + _NETWORK_TRUST * told
+        worth, tried = told, np.broadcast_to(np.arange(len(self._R)), told.shape)
+        for number, points in _ROUNDS:
+            kept = np.argpartition(-worth, number, axis=1)[:, :number]
+            tried = np.take_along_axis(tried, kept, axis=1)
+            R = self._R[tried]
+            fit = self._fit(R, R_camera_ray, centre, surface, points)
+            worth = fit + _NETWORK_TRUST * np.take_along_axis(told, tried, axis=1)
         rows, best = np.arange(len(instances)), np.zeros((len(instances), count), np.intp)
         for rank in range(count):
             best[:, rank] = worth.argmax(axis=1)
@@ -81,17 +85,17 @@ class OrientationSearch:
         R_ray_object: np.ndarray,
         R_camera_ray: np.ndarray,
         centre: np.ndarray,
-        instances: Instances,
         surface: MeasuredSurface,
+        points: int,
     ) -> np.ndarray:
-        """(n, k) mean over an instance's points of how near and how alike the model's surface is, in [0, 1]."""
+        """(n, k) mean over some of an instance's points of how near and how alike the model's surface is, in [0, 1]."""
         normals = surface.normals.reshape(-1, 3)
         pixel = np.flatnonzero((surface.owner.ravel() >= 0) & np.isfinite(normals).all(axis=1))
-        table, used = member_table(surface.owner.ravel()[pixel], len(instances), _POINTS)
+        table, used = member_table(surface.owner.ravel()[pixel], len(centre), points)
         pixel = pixel[table] if len(pixel) else table
-        points = ((surface.points.reshape(-1, 3)[pixel] - centre[:, None]) @ R_camera_ray).astype(np.float32)
+        from_centre = ((surface.points.reshape(-1, 3)[pixel] - centre[:, None]) @ R_camera_ray).astype(np.float32)
         normals = (np.nan_to_num(normals[pixel]) @ R_camera_ray).astype(np.float32)
-        cell = np.rint(points[:, None] @ R_ray_object / self._cell).astype(np.int32) + self._half
+        cell = np.rint(from_centre[:, None] @ R_ray_object / self._cell).astype(np.int32) + self._half
         inside = ((cell >= 0) & (cell < self._shape)).all(axis=-1) & used[:, None]
         flat = np.where(inside, np.ravel_multi_index(np.moveaxis(cell, -1, 0), self._shape, mode="clip"), 0)
         alike = np.einsum("nkpi,nkpi->nkp", normals[:, None] @ R_ray_object, self._normals[flat])
