@@ -60,7 +60,7 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
     real = bank_module.build_bank
 
     def build(path, object_name, names, observe, **keywords):
-        assert observe.keywords == {"estimator": "geometric", "noise": 1.0, "seed": 0}
+        assert observe.keywords == {"estimator": "dense", "noise": 1.0, "seed": 0}
         return real(path, object_name, names, partial(observe_synthetic, log=str(log)), **keywords)
 
     monkeypatch.setattr(bank_command, "observe_scene_by_name", len)
@@ -117,7 +117,7 @@ def test_ablations_give_numbers_and_a_figure(banks, tmp_path, part, monkeypatch)
     variants = {
         "steps": ["random", "random"],
         "fusion": ["clustering and exclusion", "clustering alone", "no clustering"],
-        "verification": ["verification score", "estimator's score"],
+        "verification": ["both", "verification score", "estimator's score"],
         "attention": ["learned", "lowest-score"],
     }
     assert [row["variant"] for row in rows] == variants[part]

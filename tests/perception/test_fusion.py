@@ -109,21 +109,25 @@ def test_order_and_repetition_of_views_change_nothing(name, seed, order, again):
     assert_same(fusion.objects(last_stamp, T_world_camera, DEFAULT_CAMERA), expected)
 
 
-@settings(max_examples=15, deadline=None)
+@pytest.mark.parametrize("rank_by", ["confidence", "verification", "score"])
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_survivors_are_the_best_verified_and_nothing_is_invented(seed):
+def test_survivors_are_the_best_and_nothing_is_invented(rank_by, seed):
     truth, episode = make_episode(seed)
     model = load_object("bunny")
     stamp, T_world_camera = episode[-1][:2]
-    objects = fuse(model, episode).objects(stamp, T_world_camera, DEFAULT_CAMERA)
+    objects = fuse(model, episode, FusionParameters(rank_by=rank_by)).objects(stamp, T_world_camera, DEFAULT_CAMERA)
     poses = np.concatenate([T @ hypotheses.T_camera_object for _, T, hypotheses, _ in episode])
     verification = np.concatenate([scores for *_, scores in episode])
+    score = np.concatenate([hypotheses.score for _, _, hypotheses, _ in episode])
+    worth = {"verification": verification, "score": score, "confidence": (1 + verification) * score}[rank_by]
     nearest = np.linalg.norm(poses[:, None, :3, 3] - truth[None, :, :3, 3], axis=-1).argmin(axis=1)
-    best = sorted((verification[nearest == index].max() for index in set(nearest)), reverse=True)
-    np.testing.assert_array_equal(objects.verification, best)
-    np.testing.assert_array_equal(objects.support, [np.sum(nearest == nearest[verification == v]) for v in best])
-    survivors = [poses[verification == value][0] for value in best]
-    np.testing.assert_allclose(objects.T_world_object, survivors, atol=1e-12)
+    best = sorted((worth[nearest == index].max() for index in set(nearest)), reverse=True)
+    survivors = [np.flatnonzero(worth == value)[0] for value in best]
+    np.testing.assert_array_equal(objects.verification, verification[survivors])
+    np.testing.assert_array_equal(objects.score, score[survivors])
+    np.testing.assert_array_equal(objects.support, [np.sum(nearest == nearest[index]) for index in survivors])
+    np.testing.assert_allclose(objects.T_world_object, poses[survivors], atol=1e-12)
 
 
 def test_features_come_from_the_current_view():
@@ -205,6 +209,8 @@ def test_clusters_are_those_of_naive_agglomeration(seed):
 def test_bad_parameters_and_scores_are_named():
     with pytest.raises(ValueError, match="cut must be positive"):
         FusionParameters(cut=0.0)
+    with pytest.raises(ValueError, match="rank_by must be one of confidence, verification, score"):
+        FusionParameters(rank_by="luck")
     with pytest.raises(ValueError, match="min_verification"):
         FusionParameters(min_verification=2.0)
     _, episode = make_episode(0)

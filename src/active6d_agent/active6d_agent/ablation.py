@@ -1,7 +1,6 @@
 """The paper's ablations on scene banks: what each part is worth, measured by leaving it out or turning it up."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from active6d_agent.evaluation import EpisodeResults, bootstrap_interval, run_na
 from active6d_agent.lookup import BankLookup
 from active6d_agent.train import TrainingParameters, train_policy
 from active6d_core.metrics import score_errors
-from active6d_perception.fusion import FusionParameters
+from active6d_perception.fusion import RANKINGS, FusionParameters
 
 ALPHAS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
 #: T of the paper's figure, from the single shot to all views.
@@ -64,13 +63,13 @@ def ablate_fusion(
         starts: (E, 2) scenes and first views.
         steps: budget T.
         seed: of the policy's randomness.
-        scores: compare the verification score with the estimator's; otherwise clustering with none.
+        scores: compare what hypotheses are ranked by; otherwise clustering with none.
     """
     deployed = BankLookup(bank)
     views = run_named(deployed, policy, starts, steps, seed=seed).views
     if scores:
-        other = "estimator's score", BankLookup(score_by_estimator(bank))
-        variants = (("verification score", deployed), other)
+        names = {"confidence": "both", "verification": "verification score", "score": "estimator's score"}
+        variants = tuple((names[each], BankLookup(bank, FusionParameters(rank_by=each))) for each in RANKINGS)
     else:
         alone = FusionParameters(cut=deployed.parameters.cut, exclusion=0.0)
         separate = FusionParameters(cut=1e-9, exclusion=0.0)
@@ -81,16 +80,6 @@ def ablate_fusion(
         )
     for name, lookup in variants:
         yield name, _score_views(lookup, starts[:, 0], views, seed)
-
-
-def score_by_estimator(bank: SceneBank) -> SceneBank:
-    """The bank with the estimator's own score in place of the verification score."""
-    scenes = []
-    for scene in bank.scenes:
-        table = scene.table.copy()
-        table[:, 7] = table[:, 8]
-        scenes.append(replace(scene, table=table))
-    return replace(bank, scenes=scenes)
 
 
 def _score_views(lookup: BankLookup, scene: np.ndarray, views: np.ndarray, seed: int) -> dict:

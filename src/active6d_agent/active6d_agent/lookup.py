@@ -85,8 +85,7 @@ class BankLookup:
     def _sort(self, scene: BankScene) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         T = world_poses(scene.table, scene.view, self.sphere)
         verification = scene.table[:, 7].astype(float)
-        order = preference(verification, T)
-        order = order[verification[order] >= self.parameters.min_verification]
+        order = preference(verification, scene.table[:, 8].astype(float), T, self.parameters)
         return T[order], scene.table[order], scene.view[order], scene.errors[order]
 
     def _nearest_objects(self, scene: BankScene, T_world_object: np.ndarray, errors: np.ndarray) -> np.ndarray:

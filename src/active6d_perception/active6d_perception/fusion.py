@@ -17,6 +17,9 @@ from active6d_perception.clustering import cluster, suppress_neighbours
 from active6d_perception.model_views import ModelViews, model_views
 from active6d_perception.symmetric_distance import SymmetricDistance
 
+#: Ways to rank hypotheses, see :attr:`FusionParameters.rank_by`.
+RANKINGS = ("confidence", "verification", "score")
+
 
 @dataclass(frozen=True)
 class FusionParameters:
@@ -28,6 +31,9 @@ class FusionParameters:
             stays: solid objects cannot share their centre, but a pose that is ambiguous in some views (a mug with its
             handle hidden) puts several clusters there. 0 keeps all.
         min_verification: objects verified worse are not reported; the paper reports all, so -1 by default.
+        rank_by: which hypothesis of a cluster is best. ``verification`` is equation 1 alone, the paper's; ``score`` the
+            estimator's score; ``confidence`` the product of both: the score knows of what equation 1 cannot see, since
+            a mug fits its pixels whichever way its hidden handle points.
 
     Raises:
         ValueError: a value is out of range.
@@ -36,6 +42,7 @@ class FusionParameters:
     cut: float = 0.2
     exclusion: float = 0.2
     min_verification: float = -1.0
+    rank_by: str = "confidence"
 
     def __post_init__(self) -> None:
         if not self.cut > 0:
@@ -44,6 +51,8 @@ class FusionParameters:
             raise ValueError(f"fusion: exclusion must not be negative, got {self.exclusion}")
         if not -1 <= self.min_verification <= 1:
             raise ValueError(f"fusion: min_verification must be in [-1, 1], got {self.min_verification}")
+        if self.rank_by not in RANKINGS:
+            raise ValueError(f"fusion: rank_by must be one of {', '.join(RANKINGS)}, got {self.rank_by!r}")
 
 
 def select(labels: np.ndarray, positions: np.ndarray, exclusion: float) -> np.ndarray:
@@ -86,10 +95,27 @@ def summarise(
     return support, spread, np.where(current.any(axis=1), current.argmax(axis=1), -1)
 
 
-def preference(verification: np.ndarray, T_world_object: np.ndarray) -> np.ndarray:
-    """(k,) indices by falling verification score; ties by pose, so that the order of arrival never matters."""
+def preference(
+    verification: np.ndarray, score: np.ndarray, T_world_object: np.ndarray, parameters: FusionParameters
+) -> np.ndarray:
+    """Hypotheses in the order in which fusion prefers them.
+
+    Args:
+        verification: (k,) equation 1.
+        score: (k,) the estimator's.
+        T_world_object: (k, 4, 4).
+        parameters: how to rank, and what to leave out.
+
+    Returns:
+        (h,) indices, best first; ties by pose, so that the order of arrival never matters.
+    """
+    # A score below zero must not change places when it is multiplied, so equation 1 counts from -1, its least.
+    worth = {"verification": verification, "score": score, "confidence": (1.0 + verification) * score}[
+        parameters.rank_by
+    ]
     entries = T_world_object[:, :3].reshape(len(verification), 12)
-    return np.lexsort([*entries.T, -verification])
+    order = np.lexsort([*entries.T, -worth])
+    return order[verification[order] >= parameters.min_verification]
 
 
 def project_features(
@@ -189,8 +215,7 @@ class SceneFusion:
         An object hypothesised in that view has the box and depth of its own mask there (of the best verified
         hypothesis in its cluster); for the others they are projected from the pose.
         """
-        order = preference(self._table[:, 0], self._T_world_object)
-        order = order[self._table[order, 0] >= self.parameters.min_verification]
+        order = preference(self._table[:, 0], self._table[:, 1], self._T_world_object, self.parameters)
         if not len(order):
             return SceneObjects.empty()
         T, table, stamps = self._T_world_object[order], self._table[order], self._stamp[order]

@@ -25,7 +25,7 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.node import GraphNode, run_node
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.optional_outputs import DetectionOutput
-from active6d_perception.fusion import FusionParameters, SceneFusion
+from active6d_perception.fusion import RANKINGS, FusionParameters, SceneFusion
 from active6d_perception.nodes.view_inputs import ViewInputs
 from active6d_perception.verification import Verifier
 
@@ -57,6 +57,12 @@ class HypothesisFusionNode(GraphNode):
                 "hypotheses verified worse are ignored",
                 minimum=-1.0,
                 maximum=1.0,
+            ),
+            rank_by=self.declare(
+                "rank_by",
+                FusionParameters.rank_by,
+                "what makes a hypothesis the best of its cluster: equation 1, the estimator's score, or both",
+                choices=RANKINGS,
             ),
         )
         self._objects = self.output(PointCloud2, "objects", latched=True)
