@@ -13,7 +13,7 @@ setup:  ## make .venv ready (done by the others, too)
 
 demo: setup  ## one episode on a heap of cups: a bag and a report in bags/demo
 	rm -rf $(DEMO)
-	$(BIN)/active6d episode --object coffee_cup --seed 7 --policy lowest-score --steps 5 --bag $(DEMO) --report $(DEMO)/report.html
+	$(BIN)/active6d episode --object coffee_cup --seed 7 --steps 5 --bag $(DEMO) --report $(DEMO)/report.html
 	@echo "Open $(DEMO)/report.html in a browser; the bag beside it opens in Foxglove, ros2 bag and rosbags."
 
 test: setup  ## all tests

@@ -169,7 +169,7 @@ def _summary(result: "EpisodeResult") -> dict[str, Any]:
         "object": result.settings.object,
         "scene": result.info.get("scene"),
         "seed": result.settings.seed,
-        "policy": result.settings.policy,
+        "policy": result.info.get("policy", result.settings.policy),
         "moves": len(result.steps) - 1,
         "end_reason": result.reason,
         "distance_m": result.distance,
@@ -201,7 +201,7 @@ def _print_summary(result: "EpisodeResult", summary: dict[str, Any]) -> None:
     table.add_column(style="dim")
     table.add_column()
     moves = f"{summary['moves']} moves, {result.distance:.2f} m, {result.seconds:.1f} s"
-    table.add_row("episode", escape(f"{summary['scene'] or result.settings.object}, {result.settings.policy}: {moves}"))
+    table.add_row("episode", escape(f"{summary['scene'] or result.settings.object}, {summary['policy']}: {moves}"))
     table.add_row("ended", escape(result.reason))
     if summary["objects_true"] is None:
         table.add_row("objects", str(len(result.objects)))
