@@ -16,6 +16,7 @@ from active6d_perception.rates import (
     average_precision,
     bootstrapped,
     rank_correlation,
+    recall_at_precision,
     recalls,
     thresholds,
 )
@@ -122,6 +123,9 @@ def test_average_precision_is_the_area_under_the_envelope(seed):
         [max((p for r, p in points if r >= step - 1e-12), default=0.0) for step in np.linspace(0, 1, 101)]
     )
     assert result == pytest.approx(expected)
+    for least in (0.3, 0.6, 1.0):
+        precise = max((r for r, p in points if p >= least), default=0.0)
+        assert recall_at_precision([view for view, _ in made], "mssd", limit, least) == pytest.approx(precise)
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=1, max_size=30))

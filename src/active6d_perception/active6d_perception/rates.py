@@ -80,25 +80,45 @@ def average_precision(views: Sequence[ViewResult], error: str, limits: Sequence[
     As BOP's task "6D detection" (and COCO): 101 recalls, precision made monotone; objects less than a tenth visible
     need not be found, and whoever finds one neither gains nor loses. None without an object to be found.
     """
-    total = sum((view.visible_fraction >= LEAST_VISIBLE).sum() for view in views)
-    if not total:
+    if not _objects(views):
         return None
-    score = np.concatenate([view.score for view in views])
-    order = np.argsort(-score, kind="stable")
     areas = []
     for limit in limits:
-        counted, right = [], []
-        for view in views:
-            hidden = view.visible_fraction < LEAST_VISIBLE
-            matched = view.match(error, limit, hidden.astype(int))
-            counted.append(~np.append(hidden, False)[matched])  # -1, no match, is the last
-            right.append(matched >= 0)
-        counted, right = np.concatenate(counted)[order], np.concatenate(right)[order]
-        hits = np.cumsum(right[counted])
-        precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
-        first = np.searchsorted(hits / total, _RECALL_STEPS - 1e-12)
+        recall, precision = _precision_over_recall(views, error, limit)
+        first = np.searchsorted(recall, _RECALL_STEPS - 1e-12)
         areas.append(np.append(precision, 0.0)[first].mean())
     return float(np.mean(areas))
+
+
+def recall_at_precision(views: Sequence[ViewResult], error: str, limit: float, least: float) -> float | None:
+    """Share of the objects found where the score is cut so that at least ``least`` of the hypotheses are right.
+
+    Counted as in :func:`average_precision`; 0 where no cut is that precise, None without an object to be found.
+    """
+    if not _objects(views):
+        return None
+    recall, precision = _precision_over_recall(views, error, limit)
+    return float(recall[precision >= least].max(initial=0.0))
+
+
+def _objects(views: Sequence[ViewResult]) -> int:
+    """How many objects have to be found."""
+    return sum(int((view.visible_fraction >= LEAST_VISIBLE).sum()) for view in views)
+
+
+def _precision_over_recall(views: Sequence[ViewResult], error: str, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Recall and monotone precision as the hypotheses of all views are taken in, best first."""
+    order = np.argsort(-np.concatenate([view.score for view in views]), kind="stable")
+    counted, right = [], []
+    for view in views:
+        hidden = view.visible_fraction < LEAST_VISIBLE
+        matched = view.match(error, limit, hidden.astype(int))
+        counted.append(~np.append(hidden, False)[matched])  # -1, no match, is the last
+        right.append(matched >= 0)
+    counted, right = np.concatenate(counted)[order], np.concatenate(right)[order]
+    hits = np.cumsum(right[counted])
+    precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
+    return hits / _objects(views), precision
 
 
 def area_under_curve(score: np.ndarray, right: np.ndarray) -> float | None:

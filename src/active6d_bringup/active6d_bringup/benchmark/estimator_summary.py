@@ -15,6 +15,7 @@ from active6d_perception.rates import (
     average_precision,
     bootstrapped,
     rank_correlation,
+    recall_at_precision,
     recalls,
     thresholds,
 )
@@ -27,6 +28,8 @@ VISIBLE_BINS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 FEATURE_SEEN = 0.15
 #: Views with so many objects at least a tenth visible are timed by themselves.
 CROWDED = 14
+#: Recall is told where the score is cut for this precision.
+PRECISIONS = (0.95, 0.98)
 #: A turn about the axis is right within this many degrees.
 SAME_TURN = 30.0
 
@@ -52,6 +55,9 @@ def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> 
         row[f"precision_{kind}"] = bootstrapped(hits, np.array([len(view.score) for view in result.views]), scenes)
     row["precision"] = row[f"precision_{by}"]
     row["average_precision"] = {"pose": average_precision(result.views, by, [result.limit])}
+    row["recall_at_precision"] = {
+        str(least): recall_at_precision(result.views, by, result.limit, least) for least in PRECISIONS
+    }
     for error in ("mssd", "mspd"):
         found, counts = recalls(result.views, error, result.diameter)
         limits = thresholds(error, result.diameter, result.views[0].width)

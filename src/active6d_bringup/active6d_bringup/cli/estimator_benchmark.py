@@ -105,11 +105,11 @@ def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
 
     for kind in ("mssd", "mspd"):
         add(f"average recall, {kind.upper()}", lambda row, kind=kind: _interval(row[kind]["average_recall"]))
+    for least in next(iter(rows.values()))["recall_at_precision"]:
+        add(f"found at precision {least}", lambda row, least=least: _number(row["recall_at_precision"][least]))
     for kind, label in (("pose", "10 % of the diameter"), ("mssd", "MSSD"), ("mspd", "MSPD")):
         add(f"average precision, {label}", lambda row, kind=kind: _number(row["average_precision"][kind]))
-    for kind, label in (("equation_1", "verification"), ("own_score", "own score")):
-        for measure, text in (("auc_adds", "area under the curve"), ("spearman_add", "rank correlation, e_ADD")):
-            add(f"{label}, {text}", lambda row, kind=kind, measure=measure: _number(row["verification"][kind][measure]))
+    _add_scores(add)
     if all("ambiguity" in row for row in rows.values()):
         for where in ("seen", "hidden"):
             add(f"right turn, {part} {where}", lambda row, where=where: _number(row["ambiguity"][where]["right_turn"]))
@@ -121,6 +121,12 @@ def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
             lambda row: f"{row['fused'][0]:.2f}, {row['fused'][-1]:.2f}" if "fused" in row else "-",
         )
     return table
+
+
+def _add_scores(add: Callable) -> None:
+    for kind, label in (("equation_1", "verification"), ("own_score", "own score")):
+        for measure, text in (("auc_adds", "area under the curve"), ("spearman_add", "rank correlation, e_ADD")):
+            add(f"{label}, {text}", lambda row, kind=kind, measure=measure: _number(row["verification"][kind][measure]))
 
 
 def _add_times(add: Callable, rows: dict[str, dict[str, Any]]) -> None:
