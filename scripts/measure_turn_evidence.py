@@ -7,24 +7,20 @@ The shards are training views that the weights were not learned from. Also print
 several shares that a pixel may count.
 """
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 from rich.progress import track
 from scipy.special import softmax
+from shard_arguments import read_arguments
 
-from active6d_core.object_model import load_object
 from active6d_perception.dense.decoding import decode, turn_probability
 from active6d_perception.dense.estimator import DenseEstimator
 from active6d_perception.dense.gauge import TURNS, turn_about_z
 from active6d_perception.dense.network_input import OUTPUT_STRIDE, output_camera, pool_depth
 from active6d_perception.dense.surface import MeasuredSurface
 from active6d_perception.dense.turns import TurnSearch
-from active6d_perception.dense.weights_file import load_network
 from active6d_perception.model_views import model_views
 from active6d_perception.refinement import refine
-from active6d_perception.training.samples import Sample, read_shard
+from active6d_perception.training.samples import Sample
 
 SHAPE = 7, 4
 RIGHT, WRONG, TOLERATED = np.radians([2.6, 30.0, 22.0])
@@ -54,16 +50,8 @@ def count(sample: Sample, estimator: DenseEstimator, search: TurnSearch, gauge) 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("object")
-    parser.add_argument("weights", type=Path)
-    parser.add_argument("shards", type=Path, nargs="+")
-    parser.add_argument("--every", type=int, default=6, help="take every N-th view")
-    arguments = parser.parse_args()
-    model = load_object(arguments.object)
-    trained = load_network(arguments.weights, model)
+    model, trained, samples = read_arguments(__doc__.splitlines()[0], every=6)
     estimator, search = DenseEstimator(model, trained), TurnSearch(model, trained.gauge)
-    samples = [sample for path in arguments.shards for sample in read_shard(path)][:: arguments.every]
     tables, turns = zip(*(count(sample, estimator, search, trained.gauge) for sample in track(samples)), strict=True)
     tables, turns = np.concatenate(tables), np.concatenate(turns)
     off = np.abs((TURNS - turns[:, None] + np.pi) % (2 * np.pi) - np.pi)
