@@ -147,6 +147,8 @@ def test_a_node_that_fails_to_begin_stays_inactive(graph):
 
 RUN_A_NODE = """
 import sys
+import threading
+import rclpy
 from active6d_core import node
 from test_node import DepthNode
 
@@ -157,8 +159,20 @@ class Defective(DepthNode):
     def fail(self):
         raise ValueError("a defect in the node")
 
-node.run_node(Defective if sys.argv[1] == "defect" else DepthNode)
+class Ended(DepthNode):
+    def begin(self):
+        # The context ends and nobody wakes the executor, as when rclpy's wake comes before the end.
+        threading.Timer(0.5, lambda: rclpy.get_default_context().handle.shutdown()).start()
+
+node.run_node({"defect": Defective, "end": Ended}.get(sys.argv[1], DepthNode))
 """
+
+
+def run_a_node(*arguments):
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(fresh_domain())}
+    environment["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
+    command = [sys.executable, "-c", RUN_A_NODE, *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
 
 
 @pytest.mark.parametrize(
@@ -169,13 +183,15 @@ node.run_node(Defective if sys.argv[1] == "defect" else DepthNode)
     ],
 )
 def test_exit_code_two_is_for_parameters_and_a_defect_shows_its_traceback(arguments, code, text):
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(fresh_domain())}
-    environment["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
-    command = [sys.executable, "-c", RUN_A_NODE, *arguments]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    ended = run_a_node(*arguments)
     assert ended.returncode == code
     assert text in ended.stderr
     assert ("Traceback" in ended.stderr) == (code == 1)
+
+
+def test_an_end_that_wakes_nobody_still_ends_the_node():
+    ended = run_a_node("end")
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_latched_inputs_reach_a_node_that_comes_late(graph):

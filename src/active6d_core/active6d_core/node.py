@@ -29,6 +29,7 @@ from active6d_core.conversions import HARDWARE_ID, MessageError, ns_to_stamp
 # Both ends: a reliable writer forgets what its queue cannot hold, received by everybody or not.
 _QUEUE_DEPTH = 10
 _LOG_PERIOD_SECONDS = 5.0
+_WAKE_SECONDS = 1.0
 
 
 class GraphNode(LifecycleNode):
@@ -320,7 +321,10 @@ def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> N
             sys.exit(2)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        executor.spin()
+        # Not spin(): on an interrupt rclpy wakes the executor a moment before it ends the context, and one that waits
+        # again in that moment would sleep until the next message.
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=_WAKE_SECONDS)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except RuntimeError:
