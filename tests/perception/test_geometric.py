@@ -103,7 +103,7 @@ def test_registry_names_what_it_knows():
     assert "geometric" in list_estimators()
     with pytest.raises(ValueError, match=r"unknown estimator 'psychic'; known: .*geometric"):
         create_estimator("psychic", model)
-    with pytest.raises(ValueError, match=r"no parameter 'speed'; known: references, refined, min_score"):
+    with pytest.raises(ValueError, match=r"no parameter 'speed'; it has: references, refined, min_score"):
         create_estimator("geometric", model, speed=3)
     with pytest.raises(ValueError, match="min_score must be in"):
         create_estimator("geometric", model, min_score=2.0)

@@ -5,21 +5,17 @@ take, and what is left of its budget (paper, "Problem definition"). The node, th
 speak to policies through this module.
 """
 
-import inspect
-from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel
+from active6d_core.registry import Registry
 from active6d_core.view_sphere import ViewSphere
 
-#: The name of what :func:`choose_policy` chooses.
-AUTOMATIC = "auto"
 #: Trained policies that come with this package.
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
 #: A view of the grid counts as visited when the camera was this close to it, metres of arc.
@@ -108,31 +104,6 @@ class Policy(Protocol):
         """The next move; a policy stops when the observation leaves it no candidate."""
 
 
-_PolicyFactory = TypeVar("_PolicyFactory", bound=Callable[..., Policy])
-_registry: dict[str, Callable[..., Policy]] = {}
-# Where the project's own policies live, so that a baseline does not have to wait for torch.
-_MODULES = {
-    "active6d_agent.baselines": ("random", "unidirectional", "max-distance", "lowest-score", "single-view", "entropy"),
-    "active6d_agent.attention": ("attention",),
-    "active6d_agent.view_attention": ("view-attention",),
-}
-
-
-def register_policy(name: str) -> Callable[[_PolicyFactory], _PolicyFactory]:
-    """Decorator that makes ``factory(model, **parameters)`` available as ``create_policy(name, ...)``."""
-
-    def register(factory: _PolicyFactory) -> _PolicyFactory:
-        _registry[name] = factory
-        return factory
-
-    return register
-
-
-def list_policies() -> list[str]:
-    """Names of all policies, which ``auto`` is none of."""
-    return sorted({*_registry, *(name for names in _MODULES.values() for name in names)})
-
-
 def shipped_weights(policy: str, object_name: str) -> Path:
     """Where the shipped weights of a policy for an object are, or would be."""
     return SHIPPED_WEIGHTS / f"{policy}_{object_name}.safetensors"
@@ -141,6 +112,22 @@ def shipped_weights(policy: str, object_name: str) -> Path:
 def choose_policy(object_name: str) -> str:
     """What ``auto`` stands for: the learned policy where weights ship for the object, else the best heuristic."""
     return "view-attention" if shipped_weights("view-attention", object_name).is_file() else "lowest-score"
+
+
+_BASELINES = "random", "unidirectional", "max-distance", "lowest-score", "single-view", "entropy"
+_registry = Registry(
+    "policy",
+    choose_policy,
+    {
+        **dict.fromkeys(_BASELINES, "active6d_agent.baselines"),
+        "attention": "active6d_agent.attention",
+        "view-attention": "active6d_agent.view_attention",
+    },
+)
+#: Decorates a factory ``(model, **parameters) -> Policy``; see :meth:`active6d_core.registry.Registry.register`.
+register_policy = _registry.register
+#: Names that :func:`create_policy` knows beside ``auto``.
+list_policies = _registry.names
 
 
 def create_policy(name: str, model: ObjectModel, **parameters: Any) -> Policy:
@@ -154,23 +141,7 @@ def create_policy(name: str, model: ObjectModel, **parameters: Any) -> Policy:
     Raises:
         ValueError: no such policy, no such parameter, or a value out of range; the message names it.
     """
-    if name == AUTOMATIC:
-        name = choose_policy(model.name)
-    for module, names in _MODULES.items():
-        if name in names:
-            import_module(module)
-    if name not in _registry:
-        raise ValueError(f"unknown policy '{name}'; known: {', '.join([AUTOMATIC, *list_policies()])}")
-    factory = _registry[name]
-    accepted = [item for item in inspect.signature(factory).parameters if item != "model"]
-    unknown = sorted(parameters.keys() - set(accepted))
-    if unknown:
-        known = ", ".join(accepted) if accepted else "none"
-        raise ValueError(f"policy '{name}' has no parameter '{unknown[0]}'; it has: {known}")
-    try:
-        return factory(model, **parameters)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"policy '{name}': {error}") from error
+    return _registry.create(name, model, **parameters)
 
 
 def uniform_attention(count: int) -> np.ndarray:

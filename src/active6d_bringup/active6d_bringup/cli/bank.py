@@ -39,7 +39,8 @@ def bank(
 
     from active6d_agent.bank import bank_path, build_bank, cached_banks, load_bank
     from active6d_core.object_model import load_object
-    from active6d_perception.estimator import AUTOMATIC, choose_estimator, create_estimator
+    from active6d_core.registry import AUTOMATIC
+    from active6d_perception.estimator import choose_estimator, create_estimator
 
     names = _scene_names(object_name, split, scenes, heaps)
     if estimator == AUTOMATIC:

@@ -100,8 +100,9 @@ def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
 
 def _check_names(settings: "EpisodeSettings") -> None:
     """Refuse wrong names before any node starts: a node's process could only say so in its log."""
-    from active6d_agent.policy import AUTOMATIC, list_policies
+    from active6d_agent.policy import list_policies
     from active6d_core.object_model import load_object
+    from active6d_core.registry import AUTOMATIC
     from active6d_perception.estimator import list_estimators
 
     load_object(settings.object)

@@ -75,9 +75,9 @@ class DenseParameters:
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_score <= 1:
-            raise ValueError(f"dense estimator: min_score must be in [0, 1], got {self.min_score}")
+            raise ValueError(f"min_score must be in [0, 1], got {self.min_score}")
         if self.alternatives < 1:
-            raise ValueError(f"dense estimator: alternatives must be at least 1, got {self.alternatives}")
+            raise ValueError(f"alternatives must be at least 1, got {self.alternatives}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,9 +35,9 @@ class GeometricParameters:
 
     def __post_init__(self) -> None:
         if self.references < 1 or self.refined < 1:
-            raise ValueError("geometric estimator: references and refined must be at least 1")
+            raise ValueError("references and refined must be at least 1")
         if not 0 <= self.min_score <= 1:
-            raise ValueError(f"geometric estimator: min_score must be in [0, 1], got {self.min_score}")
+            raise ValueError(f"min_score must be in [0, 1], got {self.min_score}")
 
 
 class GeometricEstimator:

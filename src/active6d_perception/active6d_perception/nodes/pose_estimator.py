@@ -11,7 +11,8 @@ from active6d_core.camera import View
 from active6d_core.conversions import hypotheses_to_cloud, poses_to_array, segmentation_to_image
 from active6d_core.node import GraphNode, run_node
 from active6d_core.object_model import load_object
-from active6d_perception.estimator import AUTOMATIC, Estimator, create_estimator, list_estimators
+from active6d_core.registry import AUTOMATIC
+from active6d_perception.estimator import Estimator, create_estimator, list_estimators
 from active6d_perception.nodes.view_inputs import ViewInputs
 
 
