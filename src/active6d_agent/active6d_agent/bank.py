@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from active6d_core.camera import View
+from active6d_core.files import cache_folder
 from active6d_core.metrics import MISSED_E_ADD, e_add
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
@@ -243,7 +244,7 @@ class SceneBank:
 
 def cached_banks() -> Path:
     """Folder that banks are made in unless another is asked for."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "active6d" / "banks"
+    return cache_folder("banks")
 
 
 def bank_path(folder: Path, object_name: str, split: str) -> Path:

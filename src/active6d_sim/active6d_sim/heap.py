@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from active6d_core.files import cache_folder
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import transform_from_quaternion
 from active6d_sim.bullet import BulletClient, connect, decompose, pybullet
@@ -167,7 +168,7 @@ def collision_file(model: ObjectModel) -> Path:
     """
     vertices = np.asarray(model.mesh.vertices)
     digest = hashlib.sha256(vertices.tobytes() + np.asarray(model.mesh.faces).tobytes()).hexdigest()[:16]
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "active6d" / "collision"
+    folder = cache_folder("collision")
     path = folder / f"{model.name}-{digest}.obj"
     if not path.is_file():
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,5 @@
 """Runs estimators on the same views of stored scenes, and counts how much fusion of several views adds."""
 
-import hashlib
 import resource
 import sys
 from collections.abc import Callable, Sequence
@@ -14,6 +13,7 @@ from active6d_bringup.benchmark.estimator_summary import summarise
 from active6d_bringup.benchmark.grid_views import GridViews
 from active6d_bringup.benchmark.peers import PEERS
 from active6d_bringup.benchmark.records import Records
+from active6d_core.files import sha256_of
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimator import Estimator, create_estimator, weights_path
@@ -71,8 +71,7 @@ def enlist(
         if name == "dense":
             path = weights or weights_path(model.name)
             estimator = create_estimator(name, model, weights=str(path))
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            contenders.append(Contender(name, f"{name} {digest[:12]}", estimator))
+            contenders.append(Contender(name, f"{name} {sha256_of(path)[:12]}", estimator))
         else:
             contenders.append(Contender(name, name, create_estimator(name, model)))
     if peers:

@@ -78,14 +78,13 @@ def _scene_names(object_name: str, split: str, scenes: int | None, heaps: int) -
 
 def _provenance(object_name: str, estimator: str, noise: float, seed: int) -> dict[str, Any]:
     """What the bank depends on: a bank of other weights is another bank."""
-    import hashlib
-
+    from active6d_core.files import sha256_of
     from active6d_perception.estimator import weights_path
 
     provenance: dict[str, Any] = {"estimator": estimator, "noise": noise, "seed": seed}
     weights = weights_path(object_name)
     if estimator == "dense" and weights.is_file():
-        provenance["weights_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
+        provenance["weights_sha256"] = sha256_of(weights)
     return provenance
 
 

@@ -75,6 +75,17 @@ def write_file(path: Path, content: str | bytes) -> None:
         raise
 
 
+def export_weights(best: Path, folder: Path, name: str) -> None:
+    """Copy weights and the JSON beside them to ``folder`` as ``name``.
+
+    Raises:
+        OSError: a file cannot be read or written.
+    """
+    for suffix in (".safetensors", ".json"):
+        write_file(folder / f"{name}{suffix}", best.with_suffix(suffix).read_bytes())
+    messages.print(f"wrote {folder / name}.safetensors and .json", highlight=False)
+
+
 def _installed_versions() -> dict[str, str]:
     versions = {}
     for name in _VERSIONS:

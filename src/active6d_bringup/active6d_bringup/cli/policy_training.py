@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from active6d_bringup.cli.bank import Banks
-from active6d_bringup.cli.output import JsonFile, ObjectName, Seed, console, messages, progress_bar, write_json
+from active6d_bringup.cli.output import (
+    JsonFile,
+    ObjectName,
+    Seed,
+    console,
+    export_weights,
+    messages,
+    progress_bar,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from active6d_agent.lookup import BankLookup
@@ -44,15 +53,16 @@ def policy(
 
     Example: [bold]active6d train policy --object mug --policy view-attention --export weights[/bold]
     """
-    from active6d_agent.bank import cached_banks, find_bank, load_bank
+    from active6d_agent.bank import find_bank, load_bank
     from active6d_agent.lookup import BankLookup
     from active6d_bringup.cli.episode import parse_overrides
+    from active6d_core.files import cache_folder
 
     if name not in LEARNED:
         raise ValueError(f"--policy '{name}' is not among {', '.join(LEARNED)}")
     groups = parse_overrides(override or [])
     paths = [find_bank(object_name, split, banks) for split in ("train", "val")]
-    folder = out or cached_banks().parent / "policies" / object_name / name
+    folder = out or cache_folder("policies") / object_name / name
     with messages.status("reading the banks"):
         lookups = [BankLookup(load_bank(path)) for path in paths]
     make = _imitation if name == "view-attention" else _ppo
@@ -60,7 +70,7 @@ def policy(
     _follow(curve, total, folder, f"{name}, {object_name}")
     best = folder / "best.safetensors"
     if export is not None:
-        _export(best, export, f"{name}_{object_name}")
+        export_weights(best, export, f"{name}_{object_name}")
     progress = _read_curve(folder)
     write_json(
         json_file, {"object": object_name, "policy": name, "weights": str(best), "seed": seed, "curve": progress}
@@ -149,12 +159,3 @@ def _draw(folder: Path, title: str) -> None:
     shown = (("detection_rate", "detection rate"), ("e_add_mm", "e_ADD [mm]"), ("distance_m", "d [m]"), third)
     panels = [Panel("minutes", label, {label: (minutes, [row[key] for row in rows])}) for key, label in shown]
     draw_panels(folder / "curve.png", f"{title}: validation scenes", panels)
-
-
-def _export(best: Path, folder: Path, name: str) -> None:
-    import shutil
-
-    folder.mkdir(parents=True, exist_ok=True)
-    for suffix in (".safetensors", ".json"):
-        shutil.copyfile(best.with_suffix(suffix), folder / f"{name}{suffix}")
-    messages.print(f"wrote {folder / name}.safetensors and .json", highlight=False)

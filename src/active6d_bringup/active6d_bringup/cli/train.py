@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from active6d_bringup.cli.output import JsonFile, ObjectName, Seed, messages, progress_bar, write_json
+from active6d_bringup.cli.output import JsonFile, ObjectName, Seed, export_weights, progress_bar, write_json
 
 app = typer.Typer(help="Train what is learned.", no_args_is_help=True)
 
@@ -41,17 +41,18 @@ def estimator(
 
     Example: [bold]active6d train estimator --object mug --export weights[/bold]
     """
+    from active6d_core.files import cache_folder
     from active6d_core.object_model import load_object
 
     model = load_object(object_name)
-    folder = data or _cache_folder() / "training" / object_name
+    folder = data or cache_folder("training") / object_name
     cores = threads or os.cpu_count() or 1
     shards = _render_missing(object_name, folder, heaps, views, cores)
     if render_only:
         return
     best, history = _train(model, shards, folder, run, _options(steps, batch, seed), cores)
     if export is not None:
-        _export(best, export, object_name)
+        export_weights(best, export, object_name)
     write_json(json_file, {"object": object_name, "weights": str(best), "validation": history})
 
 
@@ -59,10 +60,6 @@ def _options(steps: int, batch: int, seed: int) -> Any:
     from active6d_perception.training.loop import TrainingOptions
 
     return TrainingOptions(steps=steps, batch=batch, seed=seed)
-
-
-def _cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "active6d"
 
 
 def _render_missing(object_name: str, folder: Path, heaps: int, views: int, cores: int) -> dict[str, list[Path]]:
@@ -162,12 +159,3 @@ def _train(
 
         best = train(model, shards["training"], validation, folder / run, options, device, on_step)
     return best, json.loads((folder / run / "curves.json").read_text())
-
-
-def _export(best: Path, folder: Path, object_name: str) -> None:
-    import shutil
-
-    folder.mkdir(parents=True, exist_ok=True)
-    for suffix in (".safetensors", ".json"):
-        shutil.copyfile(best.with_suffix(suffix), folder / f"{object_name}{suffix}")
-    messages.print(f"wrote {folder / object_name}.safetensors and .json", highlight=False)

@@ -1,7 +1,6 @@
 """Verifies every view's hypotheses against its depth image and fuses them with those of earlier views."""
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from active6d_core.conversions import (
     require_frame,
     stamp_to_ns,
 )
+from active6d_core.files import cache_folder
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.node import GraphNode, run_node
 from active6d_core.object_model import ObjectModel, load_object
@@ -136,7 +136,7 @@ def export_mesh(model: ObjectModel) -> str:
 
     The path depends on the object only, so that recorded markers are the same every time.
     """
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "active6d" / "meshes"
+    folder = cache_folder("meshes")
     folder.mkdir(parents=True, exist_ok=True)
     path, unfinished = folder / f"{model.name}.stl", folder / f"{model.name}.{os.getpid()}.part"
     model.mesh.export(unfinished, file_type="stl")
