@@ -11,6 +11,7 @@ from active6d_agent.environment import RewardParameters
 from active6d_agent.evaluation import all_starts, run_named
 from active6d_agent.lookup import BankLookup
 from active6d_agent.train import TrainingParameters
+from active6d_agent.view_attention import new_network, save_network
 from active6d_core.metrics import evaluate_scene
 
 
@@ -55,11 +56,10 @@ def test_what_hypotheses_are_ranked_by_matters_where_the_scores_differ(lookup, s
     reversed_ = [replace(s, table=s.table.copy()) for s in lookup.bank.scenes]
     for scene in reversed_:
         scene.table[:, 8] = 1.0 - scene.table[:, 7]
-    worse = dict(
-        ablation.ablate_fusion(replace(lookup.bank, scenes=reversed_), "random", starts, 2, scores=True)
-    )
+    worse = dict(ablation.ablate_fusion(replace(lookup.bank, scenes=reversed_), "random", starts, 2, scores=True))
     assert list(worse) == ["both", "verification score", "estimator's score"]
-    assert worse["verification score"] == rows["verification score"]
+    alone = (table["verification score"] | {"against_first": None} for table in (worse, rows))
+    assert next(alone) == next(alone)
     assert worse["estimator's score"]["e_add_mm"] > rows["verification score"]["e_add_mm"]
 
 
@@ -75,7 +75,38 @@ def test_variants_are_trained_once(lookup, starts, tmp_path):
         ablation.ablate_training(banks, variants, tmp_path, starts, on_progress=lambda *told: seen.append(told[0]))
     )
     assert set(seen) == {"far", "rule"}
-    assert '"rule": "lowest-score"' in (tmp_path / "rule" / "best.json").read_text()
+    assert '"rule": "lowest-score"' in (tmp_path / "lowest-score_alpha0.3" / "best.json").read_text()
+    assert "against_first" not in rows["far"]
+    difference = rows["rule"]["detection_rate"] - rows["far"]["detection_rate"]
+    assert rows["rule"]["against_first"]["detection_rate"]["mean"] == pytest.approx(difference)
     seen.clear()
     assert dict(ablation.ablate_training(banks, variants, tmp_path, starts)) == rows
-    assert not seen
+    renamed = {"elsewhere": variants["rule"], "printed": (parameters, RewardParameters(as_printed=True))}
+    again = dict(
+        ablation.ablate_training(banks, renamed, tmp_path, starts, on_progress=lambda *told: seen.append(told))
+    )
+    assert again["elsewhere"]["e_add_mm"] == rows["rule"]["e_add_mm"]
+    assert {name for name, _ in seen} == {"printed"}
+
+
+def test_planning_varies_one_parameter_of_the_default_policy(lookup, starts, tmp_path, monkeypatch):
+    weights = tmp_path / "untrained.safetensors"
+    save_network(new_network(lookup.model), weights, "mug")
+    monkeypatch.setattr(ablation, "PLANNING", {"metres_weight": (0.0, 100.0), "stop_below": (1e6,)})
+    made = list(ablation.ablate_planning(lookup, starts, 3, parameters={"weights": str(weights)}))
+    assert [(name, value) for name, value, _ in made] == [
+        ("as shipped", None),
+        ("metres_weight", 0.0),
+        ("metres_weight", 100.0),
+        ("stop_below", 1e6),
+        ("random", None),
+    ]
+    _, free, costly, stopped, random = (row for _, _, row in made)
+    grid = lookup.sphere
+    nearest = np.sort(grid.arc(grid.positions[:, None], grid.positions[None]), axis=1)[:, 1].mean()
+    assert costly["distance_m"] < min(free["distance_m"], 6 * nearest)
+    assert (stopped["moves"], stopped["distance_m"]) == (0.0, 0.0)
+    assert costly["moves"] == random["moves"] == 3.0
+    expected = run_named(lookup, "single-view", starts, 3).detection_rate.mean()
+    assert stopped["detection_rate"] == pytest.approx(expected)
+    assert stopped["against_first"]["distance_m"]["excludes_zero"]

@@ -1,6 +1,6 @@
 """Evaluation and bounds against exhaustive search, step-by-step episodes and closed forms."""
 
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -137,12 +137,26 @@ def test_search_ends_where_no_view_is_left(lookup):
 # The table
 
 
-def test_the_bootstrap_is_the_normal_interval_of_many_values():
+def test_the_bootstrap_of_episodes_is_the_normal_interval_of_many_values():
     values = np.random.default_rng(0).normal(3.0, 2.0, 4000)
-    low, high = evaluation.bootstrap_interval(values, np.random.default_rng(1))
+    low, high = evaluation.Intervals(np.arange(4000) % 10, seed=1).of(values)["ci95"]
     half = 1.96 * 2.0 / np.sqrt(4000)
     assert low == pytest.approx(values.mean() - half, abs=0.1 * half)
     assert high == pytest.approx(values.mean() + half, abs=0.1 * half)
+
+
+def test_the_bootstrap_of_scenes_draws_them_whole():
+    """All 5^5 ways to draw five scenes, of unequal sizes, one after the other."""
+    rng = np.random.default_rng(4)
+    scene = np.repeat([3, 0, 7, 1, 2], [4, 9, 6, 2, 5])
+    values = rng.normal(size=len(scene)) + rng.normal(size=8)[scene]
+    means = []
+    for drawn in product(np.unique(scene), repeat=5):
+        together = np.concatenate([values[scene == one] for one in drawn])
+        means.append(together.mean())
+    intervals = evaluation.Intervals(scene, seed=1, resamples=50_000).of(values)
+    np.testing.assert_allclose(intervals["ci95_scenes"], np.quantile(means, [0.025, 0.975]), atol=0.02 * np.ptp(means))
+    assert np.ptp(intervals["ci95_scenes"]) > np.ptp(intervals["ci95"]), "episodes of a scene are alike"
 
 
 def test_the_table_pairs_policies_and_says_how_much_of_the_gap_is_closed(lookup, starts):
@@ -150,7 +164,7 @@ def test_the_table_pairs_policies_and_says_how_much_of_the_gap_is_closed(lookup,
     results = dict(evaluation.evaluate(lookup, names, 3, starts))
     table = evaluation.summarise(results, "mug", 3)
     rows = table["policies"]
-    assert (table["object"], table["steps"], table["episodes"]) == ("mug", 3, len(starts))
+    assert (table["object"], table["steps"], table["episodes"], table["scenes"]) == ("mug", 3, len(starts), 2)
     assert rows["random"]["gap_closed"] == 0.0
     assert rows["oracle"]["gap_closed"] == 1.0
     low, own, high = (rows[name]["detection_rate"] for name in ("random", "max-distance", "oracle"))
@@ -159,8 +173,23 @@ def test_the_table_pairs_policies_and_says_how_much_of_the_gap_is_closed(lookup,
     assert won["mean"] == pytest.approx(rows["oracle"]["detection_rate"] - rows["single-view"]["detection_rate"])
     assert won["ci95"][0] > 0
     assert won["ci95"][0] <= won["mean"] <= won["ci95"][1]
+    assert won["excludes_zero"]
+    assert won["excludes_zero_scenes"]
     for row in rows.values():
         for name in ("detection_rate", "e_add_mm"):
-            assert row[f"{name}_ci95"][0] <= row[name] <= row[f"{name}_ci95"][1]
+            for kind in ("ci95", "ci95_scenes"):
+                assert row[f"{name}_{kind}"][0] <= row[name] <= row[f"{name}_{kind}"][1]
     alone = evaluation.summarise({"random": results["random"]}, "mug", 3)
     assert alone["policies"]["random"]["gap_closed"] is None
+
+
+def test_differences_are_resampled_by_scene_start_by_start(lookup, starts):
+    """Of two scenes, a quarter of the draws takes one of them twice: the interval reaches from one to the other."""
+    results = dict(evaluation.evaluate(lookup, ["random", "max-distance"], 2, starts))
+    against = evaluation.summarise(results, "mug", 2)["policies"]["max-distance"]["against"]["random"]
+    for name, told in against.items():
+        differences = getattr(results["max-distance"], name) - getattr(results["random"], name)
+        by_scene = sorted(differences[starts[:, 0] == scene].mean() for scene in (0, 1))
+        np.testing.assert_allclose(told["ci95_scenes"], by_scene)
+        assert told["excludes_zero_scenes"] == (np.sign(by_scene).sum() != 0)
+        assert told["mean"] == pytest.approx(differences.mean())

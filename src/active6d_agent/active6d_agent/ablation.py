@@ -7,7 +7,7 @@ import numpy as np
 
 from active6d_agent.bank import SceneBank
 from active6d_agent.environment import RewardParameters
-from active6d_agent.evaluation import EpisodeResults, bootstrap_interval, run_named
+from active6d_agent.evaluation import Intervals, describe, run_named
 from active6d_agent.lookup import BankLookup
 from active6d_agent.train import TrainingParameters, train_policy
 from active6d_core.metrics import score_errors
@@ -16,21 +16,23 @@ from active6d_perception.fusion import RANKINGS, FusionParameters
 ALPHAS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
 #: T of the paper's figure, from the single shot to all views.
 STEPS = (0, 1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 99)
-_MEASURED = ("detection_rate", "e_add_mm", "distance_m")
-
-
-def describe(results: EpisodeResults, seed: int = 0) -> dict:
-    """Means with 95 % intervals."""
-    row: dict = {}
-    for name in _MEASURED:
-        values = getattr(results, name)
-        row[name] = float(values.mean())
-        row[f"{name}_ci95"] = bootstrap_interval(values, np.random.default_rng(seed))
-    return row
+#: Parameters of ``view-attention`` at run time and what they are set to, one at a time.
+PLANNING = {
+    "lookahead": (0.0, 0.5, 1.0),
+    "error_weight": (0.0, 0.25, 0.5, 1.0, 2.0),
+    "metres_weight": (0.0, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0),
+    "stop_below": (0.0, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0),
+}
 
 
 def ablate_steps(
-    lookup: BankLookup, names: Sequence[str], starts: np.ndarray, steps: Sequence[int] = STEPS, *, seed: int = 0
+    lookup: BankLookup,
+    names: Sequence[str],
+    starts: np.ndarray,
+    steps: Sequence[int] = STEPS,
+    *,
+    seed: int = 0,
+    parameters: dict[str, dict] | None = None,
 ) -> Iterator[tuple[str, int, dict]]:
     """Policies with budgets from the single view to all views; yields name, T and what it achieved.
 
@@ -40,11 +42,43 @@ def ablate_steps(
         starts: (E, 2) scenes and first views.
         steps: budgets T; those beyond the grid are left out.
         seed: of the policies' randomness.
+        parameters: name of a policy to its parameters.
     """
+    intervals = Intervals(starts[:, 0], seed)
     for name in names:
         for budget in steps:
             if budget < len(lookup.sphere):
-                yield name, budget, describe(run_named(lookup, name, starts, budget, seed=seed), seed)
+                own = (parameters or {}).get(name)
+                results = run_named(lookup, name, starts, budget, seed=seed, parameters=own)
+                yield name, budget, describe(results.measures, intervals)
+
+
+def ablate_planning(
+    lookup: BankLookup, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict | None = None
+) -> Iterator[tuple[str, float | None, dict]]:
+    """``view-attention`` as it is, then with one parameter of :data:`PLANNING` set, then Random; nothing is trained.
+
+    Yields the parameter (or "as shipped", or "random"), its value (or None) and what it achieved, against the first;
+    ``moves`` is how many were taken.
+
+    Args:
+        lookup: of the bank.
+        starts: (E, 2) scenes and first views.
+        steps: budget T.
+        seed: of Random.
+        parameters: of the policy in all rows.
+    """
+    intervals, first = Intervals(starts[:, 0], seed), None
+    runs = [("as shipped", None), *((name, value) for name, values in PLANNING.items() for value in values)]
+    for name, value in [*runs, ("random", None)]:
+        if name == "random":
+            results = run_named(lookup, name, starts, steps, seed=seed)
+        else:
+            changed = {**(parameters or {}), **({} if value is None else {name: value})}
+            results = run_named(lookup, "view-attention", starts, steps, seed=seed, parameters=changed)
+        measures = {**results.measures, "moves": (results.views >= 0).sum(axis=1) - 1.0}
+        yield name, value, describe(measures, intervals, first)
+        first = first or measures
 
 
 def ablate_fusion(
@@ -78,12 +112,15 @@ def ablate_fusion(
             ("clustering alone", BankLookup(bank, alone)),
             ("no clustering", BankLookup(bank, separate)),
         )
+    intervals, first = Intervals(starts[:, 0], seed), None
     for name, lookup in variants:
-        yield name, _score_views(lookup, starts[:, 0], views, seed)
+        measures = _score_views(lookup, starts[:, 0], views)
+        yield name, describe(measures, intervals, first)
+        first = first or measures
 
 
-def _score_views(lookup: BankLookup, scene: np.ndarray, views: np.ndarray, seed: int) -> dict:
-    """What (E, v) views amount to under a look-up's fusion."""
+def _score_views(lookup: BankLookup, scene: np.ndarray, views: np.ndarray) -> dict[str, np.ndarray]:
+    """What (E, v) views amount to under a look-up's fusion, episode by episode."""
     fused = lookup.fuse(scene, views, views[np.arange(len(views)), (views >= 0).sum(axis=1) - 1])
     counts = lookup.object_count[scene]
     columns: dict[str, list[float]] = {"detection_rate": [], "e_add_mm": [], "detection_rate_at_n": [], "reported": []}
@@ -93,11 +130,7 @@ def _score_views(lookup: BankLookup, scene: np.ndarray, views: np.ndarray, seed:
         measured = (whole.detection_rate, whole.mean_e_add_mm, first.detection_rate, len(rows) / count)
         for column, value in zip(columns.values(), measured, strict=True):
             column.append(value)
-    row: dict = {}
-    for name, column in columns.items():
-        row[name] = float(np.mean(column))
-        row[f"{name}_ci95"] = bootstrap_interval(np.array(column), np.random.default_rng(seed))
-    return row
+    return {name: np.array(column) for name, column in columns.items()}
 
 
 def ablate_training(
@@ -109,9 +142,11 @@ def ablate_training(
     seed: int = 0,
     on_progress: Callable[[str, int], None] = lambda name, steps: None,
 ) -> Iterator[tuple[str, dict]]:
-    """Train the paper's policy in several variants and evaluate each; yields the variant's name and what it achieved.
+    """Train the paper's policy in several variants and evaluate each; yields the variant's name and what it achieved,
+    against the first.
 
-    A variant that an earlier call has trained to the same length is not trained again.
+    A training is known by what is varied, not by its name: one that an earlier call, perhaps of another ablation, has
+    taken to the same length is not repeated.
 
     Args:
         banks: look-ups of ``train``, ``val`` and ``test``.
@@ -121,10 +156,13 @@ def ablate_training(
         seed: of the evaluation.
         on_progress: called with the variant and its environment steps so far.
     """
+    intervals, first = Intervals(starts[:, 0], seed), None
     for name, (parameters, reward) in variants.items():
-        own = folder / name
+        own = folder / f"{parameters.attend}_alpha{reward.alpha:g}{'_as_printed' * reward.as_printed}"
         resume = (own / "latest.json").is_file()
         for progress in train_policy(banks["train"], banks["val"], own, parameters, reward, resume=resume):
             on_progress(name, progress.steps)
         weights = {"weights": str(own / "best.safetensors")}
-        yield name, describe(run_named(banks["test"], "attention", starts, parameters.steps, parameters=weights), seed)
+        results = run_named(banks["test"], "attention", starts, parameters.steps, parameters=weights)
+        yield name, describe(results.measures, intervals, first)
+        first = first or results.measures

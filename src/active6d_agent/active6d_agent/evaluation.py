@@ -10,6 +10,7 @@ from active6d_agent.oracle import search_views
 from active6d_agent.policy import Observation, Policy, create_policy
 
 BOUNDS = ("oracle", "all-views")
+MEASURES = ("detection_rate", "e_add_mm", "distance_m")
 _RESAMPLES = 2000
 # Episodes between two reports of progress.
 _TOGETHER = 100
@@ -20,16 +21,23 @@ class EpisodeResults:
     """What E episodes of one policy ended with.
 
     Attributes:
+        scene: (E,) indices.
         detection_rate: (E,) fraction of the objects.
         e_add_mm: (E,) mean over the objects, 50 mm for the missed.
         distance_m: (E,) along the hemisphere.
         views: (E, T + 1) views taken, -1 after an early stop.
     """
 
+    scene: np.ndarray
     detection_rate: np.ndarray
     e_add_mm: np.ndarray
     distance_m: np.ndarray
     views: np.ndarray
+
+    @property
+    def measures(self) -> dict[str, np.ndarray]:
+        """The paper's three measures by name, (E,) each."""
+        return {name: getattr(self, name) for name in MEASURES}
 
 
 def all_starts(lookup: BankLookup, sample: int | None = None, seed: int = 0) -> np.ndarray:
@@ -119,6 +127,7 @@ def measure(lookup: BankLookup, scene: np.ndarray, views: np.ndarray) -> Episode
     positions = lookup.sphere.positions[views]
     arcs = np.where(views[:, 1:] >= 0, lookup.sphere.arc(positions[:, :-1], positions[:, 1:]), 0.0)
     return EpisodeResults(
+        scene=scene,
         detection_rate=np.array([score.detection_rate for score in scores]),
         e_add_mm=np.array([score.mean_e_add_mm for score in scores]),
         distance_m=arcs.sum(axis=1),
@@ -164,16 +173,38 @@ def _all_views(lookup: BankLookup, starts: np.ndarray) -> EpisodeResults:
     views = (grid + starts[:, 1:]) % len(grid)
     steps = lookup.sphere.positions[views]
     metres = lookup.sphere.arc(steps[:, :-1], steps[:, 1:]).sum(axis=1)
-    return EpisodeResults(once.detection_rate[inverse], once.e_add_mm[inverse], metres, views)
+    return EpisodeResults(starts[:, 0], once.detection_rate[inverse], once.e_add_mm[inverse], metres, views)
 
 
-def bootstrap_interval(values: np.ndarray, rng: np.random.Generator, resamples: int = _RESAMPLES) -> list[float]:
-    """95 % interval of the mean of (E,) values by resampling episodes.
+class Intervals:
+    """95 % bootstrap intervals of means over E episodes, by resampling in two ways.
+
+    ``ci95`` draws episodes: what other starts in these very scenes could have given. ``ci95_scenes`` draws whole scenes
+    with all their starts (a cluster bootstrap): what other scenes could have given. The starts of a scene look at the
+    same heap, so they are not independent and say less together than their number suggests; a claim about scenes not
+    seen needs the second interval, which is the wider one. Ten scenes are few for it: expect it to be a tenth or so too
+    narrow still.
 
     Of two policies from the same starts, give the differences: that pairs them.
+
+    Args:
+        scene: (E,) indices of the episodes' scenes.
+        seed: of the resampling.
+        resamples: drawn of each kind.
     """
-    counts = rng.multinomial(len(values), np.full(len(values), 1.0 / len(values)), size=resamples)
-    return np.quantile(counts @ values / len(values), [0.025, 0.975]).tolist()
+
+    def __init__(self, scene: np.ndarray, seed: int = 0, resamples: int = _RESAMPLES) -> None:
+        clusters = {"ci95": np.arange(len(scene)), "ci95_scenes": np.unique(scene, return_inverse=True)[1]}
+        self._weights = {}
+        for kind, cluster in clusters.items():
+            count = cluster.max() + 1
+            rng = np.random.default_rng(seed)
+            weight = rng.multinomial(count, np.full(count, 1.0 / count), size=resamples)[:, cluster]
+            self._weights[kind] = weight / weight.sum(axis=1, keepdims=True)
+
+    def of(self, values: np.ndarray) -> dict[str, list[float]]:
+        """Both intervals of the mean of (E,) values, by name."""
+        return {kind: np.quantile(weight @ values, [0.025, 0.975]).tolist() for kind, weight in self._weights.items()}
 
 
 def evaluate(
@@ -206,6 +237,28 @@ def evaluate(
         yield name, EpisodeResults(*map(np.concatenate, columns))
 
 
+def describe(measures: dict[str, np.ndarray], intervals: Intervals, first: dict[str, np.ndarray] | None = None) -> dict:
+    """The mean of each measure (E,) as ``name``, with ``name_ci95`` and ``name_ci95_scenes`` (:class:`Intervals`); and
+    ``against_first``, the paired differences to other measures (:func:`compare`), where those are given."""
+    row: dict = {}
+    for name, values in measures.items():
+        row[name] = float(values.mean())
+        row |= {f"{name}_{kind}": interval for kind, interval in intervals.of(values).items()}
+    return row if first is None else {**row, "against_first": compare(measures, first, intervals)}
+
+
+def compare(own: dict[str, np.ndarray], other: dict[str, np.ndarray], intervals: Intervals) -> dict[str, dict]:
+    """Paired differences of each measure (E,), positive where ``own`` is higher: ``mean``, both intervals, and whether
+    these exclude zero (``excludes_zero``, ``excludes_zero_scenes``)."""
+    table = {}
+    for name, values in own.items():
+        difference = values - other[name]
+        both = intervals.of(difference)
+        sure = {f"excludes_zero{kind.removeprefix('ci95')}": low > 0 or high < 0 for kind, (low, high) in both.items()}
+        table[name] = {"mean": float(difference.mean()), **both, **sure}
+    return table
+
+
 def summarise(results: dict[str, EpisodeResults], object_name: str, steps: int, seed: int = 0) -> dict:
     """The table: means with 95 % intervals, paired differences to every other policy, and the share of the gap closed.
 
@@ -216,32 +269,26 @@ def summarise(results: dict[str, EpisodeResults], object_name: str, steps: int, 
         seed: of the resampling.
 
     Returns:
-        ``{"object", "steps", "episodes", "policies": {name: {...}}}``; ``gap_closed`` is None unless ``random`` and
-        ``oracle`` are among the results; ``against`` holds differences, positive where this policy's value is higher.
+        ``{"object", "steps", "episodes", "scenes", "policies": {name: {...}}}``; a policy's row is that of
+        :func:`describe`, with ``gap_closed``, None unless ``random`` and ``oracle`` are among the results, and
+        ``against``: every other policy's name to :func:`compare`.
     """
+    scene = next(iter(results.values())).scene
+    intervals = Intervals(scene, seed)
     table = {}
     for name, own in results.items():
-        row: dict = {"distance_m": float(own.distance_m.mean())}
-        for measured in ("detection_rate", "e_add_mm"):
-            values = getattr(own, measured)
-            row[measured] = float(values.mean())
-            row[f"{measured}_ci95"] = bootstrap_interval(values, np.random.default_rng(seed))
-        row["gap_closed"] = _gap_closed(results, own)
-        row["against"] = {
-            other: {
-                measured: _difference(getattr(own, measured) - getattr(theirs, measured), seed)
-                for measured in ("detection_rate", "e_add_mm", "distance_m")
-            }
+        against = {
+            other: compare(own.measures, theirs.measures, intervals)
             for other, theirs in results.items()
             if other != name
         }
-        table[name] = row
-    episodes = len(next(iter(results.values())).detection_rate)
-    return {"object": object_name, "steps": steps, "episodes": episodes, "policies": table}
-
-
-def _difference(values: np.ndarray, seed: int) -> dict:
-    return {"mean": float(values.mean()), "ci95": bootstrap_interval(values, np.random.default_rng(seed))}
+        table[name] = {
+            **describe(own.measures, intervals),
+            "gap_closed": _gap_closed(results, own),
+            "against": against,
+        }
+    scenes = len(np.unique(scene))
+    return {"object": object_name, "steps": steps, "episodes": len(scene), "scenes": scenes, "policies": table}
 
 
 def _gap_closed(results: dict[str, EpisodeResults], own: EpisodeResults) -> float | None:
