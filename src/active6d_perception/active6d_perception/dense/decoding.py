@@ -41,7 +41,8 @@ class Instances:
     Attributes:
         pixel: (p,) flat indices into the answer's image.
         label: (p,) index of each pixel's instance.
-        T_camera_axis: (n, 4, 4) pose of the axis frame, at turn 0 where the turn is not told by coordinates.
+        T_camera_axis: (n, 4, 4) pose of the axis frame. Centre and axis are voted for; its turn is the likeliest one
+            where every turn looks different, elsewhere the one that faces the camera.
         direction: (n, DIRECTION_BINS) distribution of the axis frame's x, in the frame of the ray through its origin.
     """
 
@@ -89,6 +90,7 @@ def decode(
     direction = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
     T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
     if gauge.turn is Turn.VISIBLE:
+        # For the fit of coordinates to start at; the search for orientations takes centre and axis alone.
         T = T @ turn_about_z(TURNS[turn_probability(T, direction).argmax(axis=1)])
     else:
         T = facing_camera(T)
