@@ -11,6 +11,7 @@ from active6d_agent.evaluation import all_starts, run_named
 from active6d_agent.lookup import BankLookup
 from active6d_bringup.cli import app
 from active6d_bringup.cli import bank as bank_command
+from active6d_perception.fusion import RANKINGS
 
 
 def run(*arguments: str):
@@ -106,7 +107,29 @@ def test_a_scene_is_seen_as_the_graph_sees_it(monkeypatch):
     np.testing.assert_allclose(own[:, 8], found.score, atol=1e-6)
 
 
-@pytest.mark.parametrize("part", ["steps", "fusion", "verification", "attention"])
+@pytest.fixture(scope="module")
+def untrained(tmp_path_factory):
+    """A folder of trainings with weights that nobody trained."""
+    import torch
+
+    from active6d_agent import attention, view_attention
+    from active6d_core.object_model import load_object
+
+    folder = tmp_path_factory.mktemp("policies")
+    for seed in range(3):
+        torch.manual_seed(seed)
+        for name in ("view-attention", "attention"):
+            own = folder / "mug" / name / f"seed{seed}"
+            if name == "attention":
+                attention.save_network(attention.AttentionNetwork(2), own / "best.safetensors")
+            else:
+                network = view_attention.new_network(load_object("mug"))
+                view_attention.save_network(network, own / "best.safetensors", "mug")
+            (own / "curve.jsonl").write_text(json.dumps({"seconds": 90.0}) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize("part", ["steps", "fusion", "verification", "attention", "signs"])
 def test_ablations_give_numbers_and_a_figure(banks, tmp_path, part, monkeypatch):
     monkeypatch.setattr("active6d_agent.ablation.STEPS", (0, 2))
     file, png = tmp_path / "x.json", tmp_path / "x.png"
@@ -117,13 +140,70 @@ def test_ablations_give_numbers_and_a_figure(banks, tmp_path, part, monkeypatch)
     variants = {
         "steps": ["random", "random"],
         "fusion": ["clustering and exclusion", "clustering alone", "no clustering"],
-        "verification": ["both", "verification score", "estimator's score"],
+        "verification": list(RANKINGS),
         "attention": ["learned", "lowest-score"],
+        "signs": ["turned round", "as printed"],
     }
     assert [row["variant"] for row in rows] == variants[part]
     for row in rows:
         assert row["detection_rate_ci95"][0] <= row["detection_rate"] <= row["detection_rate_ci95"][1]
     assert png.stat().st_size > 1000
+
+
+def test_planning_trades_metres_and_moves(banks, tmp_path, untrained, monkeypatch):
+    monkeypatch.setattr("active6d_agent.ablation.PLANNING", {"metres_weight": (0.0, 9.0), "stop_below": (1e9,)})
+    file, png = tmp_path / "x.json", tmp_path / "x.png"
+    weights = untrained / "mug/view-attention/seed1/best.safetensors"
+    common = ("--sample", "6", "--steps", "2", "--banks", str(banks), "--set", f"view-attention.weights={weights}")
+    result = run("ablate", "planning", *common, "--json", str(file), "--png", str(png))
+    assert result.exit_code == 0, result.stderr
+    rows = {row["variant"]: row for row in json.loads(file.read_text())["rows"]}
+    assert list(rows) == ["as shipped", "metres_weight 0", "metres_weight 9", "stop_below 1e+09", "random"]
+    assert rows["metres_weight 9"]["distance_m"] < rows["metres_weight 0"]["distance_m"]
+    assert rows["stop_below 1e+09"]["moves"] == 0.0
+    assert png.stat().st_size > 1000
+    result = run("evaluate", *common, "--policies", "random,view-attention", "--json", str(file))
+    assert result.exit_code == 0, result.stderr
+    against = json.loads(file.read_text())["policies"]["view-attention"]["against"]["random"]
+    assert f"{against['detection_rate']['mean']:+.3f}" in result.stdout
+    assert rows["random"]["against_first"]["e_add_mm"]["mean"] == pytest.approx(-against["e_add_mm"]["mean"])
+
+
+def test_seeds_are_told_apart_on_validation_scenes(banks, tmp_path, untrained, monkeypatch):
+    from shutil import copyfile
+
+    monkeypatch.setattr("active6d_agent.policy.SHIPPED_WEIGHTS", tmp_path)
+    copyfile(untrained / "mug/attention/seed2/best.safetensors", tmp_path / "attention_mug.safetensors")
+    file = tmp_path / "x.json"
+    common = ("--steps", "2", "--banks", str(banks))
+    result = run("ablate", "seeds", *common, "--out", str(untrained), "--json", str(file), "--sample", "7")
+    assert result.exit_code == 0, result.stderr
+    rows = json.loads(file.read_text())["rows"]
+    assert [(row["policy"], row["training_seed"]) for row in rows if row["shipped"]] == [("attention", 2)]
+    for policy in ("attention", "view-attention"):
+        own = [row for row in rows if row["policy"] == policy]
+        assert [row["training_seed"] for row in own] == [0, 1, 2]
+        most = max(row["validation_detection_rate"] for row in own)
+        assert [row["validation_detection_rate"] for row in own if row["best_on_validation"]] == [most]
+    # The made-up banks of all splits are the same, so test figures are validation figures.
+    assert rows[4]["detection_rate"] == pytest.approx(rows[4]["validation_detection_rate"])
+    assert rows[0]["training_minutes"] == 1.5
+
+
+def test_missing_seeds_are_trained(tmp_path, monkeypatch):
+    from active6d_bringup.cli import ablate
+
+    asked = []
+    monkeypatch.setattr(
+        "active6d_bringup.cli.policy_training.policy",
+        lambda name, policy, steps, *, out, banks, seed: asked.append((policy, seed, out)),
+    )
+    there = tmp_path / "mug" / "attention" / "seed1" / "best.safetensors"
+    there.parent.mkdir(parents=True)
+    there.touch()
+    ablate._train_seeds("mug", tmp_path, 5, None)
+    assert asked[3:] == [("attention", seed, tmp_path / "mug" / "attention" / f"seed{seed}") for seed in (0, 2)]
+    assert len(asked) == 5
 
 
 @pytest.mark.parametrize(

@@ -97,13 +97,12 @@ def ablate_fusion(
         starts: (E, 2) scenes and first views.
         steps: budget T.
         seed: of the policy's randomness.
-        scores: compare what hypotheses are ranked by; otherwise clustering with none.
+        scores: compare what hypotheses are ranked by (``rank_by``); otherwise clustering with none.
     """
     deployed = BankLookup(bank)
     views = run_named(deployed, policy, starts, steps, seed=seed).views
     if scores:
-        names = {"confidence": "both", "verification": "verification score", "score": "estimator's score"}
-        variants = tuple((names[each], BankLookup(bank, FusionParameters(rank_by=each))) for each in RANKINGS)
+        variants = tuple((each, BankLookup(bank, FusionParameters(rank_by=each))) for each in RANKINGS)
     else:
         alone = FusionParameters(cut=deployed.parameters.cut, exclusion=0.0)
         separate = FusionParameters(cut=1e-9, exclusion=0.0)

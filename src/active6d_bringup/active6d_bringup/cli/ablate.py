@@ -1,4 +1,4 @@
-"""``active6d ablate alpha|steps|attention|verification|fusion``: the paper's figures."""
+"""``active6d ablate PART``: the paper's figures, and what else a policy owes to its parts."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -23,6 +23,15 @@ class Part(StrEnum):
     ATTENTION = "attention"
     VERIFICATION = "verification"
     FUSION = "fusion"
+    SIGNS = "signs"
+    PLANNING = "planning"
+    SEEDS = "seeds"
+
+
+_TRAINED = (Part.ALPHA, Part.ATTENTION, Part.SIGNS)
+#: Trainings of each learned policy that ``seeds`` compares.
+_SEEDS = 3
+_OUT = "Folder of the trainings; the cache's."
 
 
 def ablate(
@@ -33,10 +42,13 @@ def ablate(
     ] = "random,max-distance,lowest-score",
     steps: Annotated[int, typer.Option(min=1, help="Budget of moves T, where it is not varied.")] = 5,
     length: Annotated[
-        int, typer.Option(min=1, help="Environment steps of each training (alpha, attention).")
+        int, typer.Option(min=1, help="Environment steps of each training (alpha, attention, signs).")
     ] = 200_000,
     sample: Sample = 200,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the trainings; the cache's.")] = None,
+    override: Annotated[
+        list[str] | None, typer.Option("--set", metavar="POLICY.NAME=VALUE", help="For steps and planning; repeatable.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help=_OUT)] = None,
     png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the figure into this PNG.")] = None,
     banks: Banks = None,
     seed: Seed = 0,
@@ -45,26 +57,35 @@ def ablate(
     """Measure what a part is worth, as in the paper's figures.
 
     alpha: the weight of getting closer in the reward. steps: the number of moves. attention: the learned one against
-    the lowest score. verification: its score against the estimator's. fusion: with clustering and without.
+    the lowest score. verification: its score against the estimator's. fusion: with clustering and without. signs: the
+    reward's, turned round and as the paper prints them. planning: what the default policy weighs, without training.
+    seeds: three trainings of both learned policies, made where they are missing.
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """
     from active6d_agent.bank import find_bank, load_bank
     from active6d_agent.evaluation import all_starts
     from active6d_agent.lookup import BankLookup
+    from active6d_bringup.cli.episode import parse_overrides
     from active6d_bringup.report.lines import draw_panels
 
-    trained = part in (Part.ALPHA, Part.ATTENTION)
-    splits = ("train", "val", "test") if trained else ("test",)
+    splits = {Part.SEEDS: ("val", "test"), **dict.fromkeys(_TRAINED, ("train", "val", "test"))}.get(part, ("test",))
     paths = {split: find_bank(object_name, split, banks) for split in splits}
+    parameters = parse_overrides(override or [])
+    if part is Part.SEEDS:
+        weights = _train_seeds(object_name, out, steps, banks)
     with messages.status("reading the banks"):
         lookups = {split: BankLookup(load_bank(path)) for split, path in paths.items()}
     starts = all_starts(lookups["test"], sample, seed)
     names = [name.strip() for name in policies.split(",")]
-    if trained:
-        rows = _train_variants(part, lookups, _folder(out, object_name, part), steps, length, starts, seed)
+    if part in _TRAINED:
+        rows = _train_variants(part, lookups, _folder(out, object_name), steps, length, starts, seed)
     elif part is Part.STEPS:
-        rows = _vary_steps(lookups["test"], names, starts, seed)
+        rows = _vary_steps(lookups["test"], names, starts, seed, parameters)
+    elif part is Part.PLANNING:
+        rows = _vary_planning(lookups["test"], starts, steps, seed, parameters)
+    elif part is Part.SEEDS:
+        rows = _compare_seeds(lookups, weights, starts, steps, sample, seed)
     else:
         rows = _vary_fusion(part, lookups["test"], names[0], starts, steps, seed)
     _print(rows, f"{part.value}, {object_name}, {len(starts)} episodes")
@@ -76,10 +97,10 @@ def ablate(
     write_json(json_file, {**common, "bank": bank, "rows": rows})
 
 
-def _folder(out: Path | None, object_name: str, part: Part) -> Path:
+def _folder(out: Path | None, object_name: str) -> Path:
     from active6d_agent.bank import cached_banks
 
-    return (out or cached_banks().parent / "ablations") / object_name / part.value
+    return (out or cached_banks().parent / "ablations") / object_name
 
 
 def _train_variants(
@@ -93,6 +114,9 @@ def _train_variants(
     common = {"steps": steps, "total": length, "rollout": 4 * steps, "seed": seed}
     if part is Part.ALPHA:
         variants = {str(alpha): (TrainingParameters(**common), RewardParameters(alpha=alpha)) for alpha in ALPHAS}
+    elif part is Part.SIGNS:
+        signs = {"turned round": RewardParameters(), "as printed": RewardParameters(as_printed=True)}
+        variants = {name: (TrainingParameters(**common), reward) for name, reward in signs.items()}
     else:
         variants = {rule: (TrainingParameters(**common, attend=rule), RewardParameters()) for rule in ATTENTION_RULES}
     with progress_bar() as bar:
@@ -109,17 +133,90 @@ def _train_variants(
         return [{"variant": name, **row} for name, row in made]
 
 
-def _vary_steps(lookup: "BankLookup", names: list[str], starts: Any, seed: int) -> list[dict]:
+def _vary_steps(
+    lookup: "BankLookup", names: list[str], starts: Any, seed: int, parameters: dict[str, dict]
+) -> list[dict]:
     from active6d_agent.ablation import STEPS, ablate_steps
     from active6d_bringup.cli.evaluate import usable_policies
 
-    usable_policies(",".join(names), lookup.bank, {})
+    usable_policies(",".join(names), lookup.bank, parameters)
     rows = []
     with progress_bar() as bar:
         task = bar.add_task("moving", total=len(names) * sum(STEPS))
-        for name, budget, row in ablate_steps(lookup, names, starts, STEPS, seed=seed):
+        for name, budget, row in ablate_steps(lookup, names, starts, STEPS, seed=seed, parameters=parameters):
             rows.append({"variant": name, "budget": budget, **row})
             bar.update(task, advance=budget, description=f"{name}, T = {budget}")
+    return rows
+
+
+def _vary_planning(lookup: "BankLookup", starts: Any, steps: int, seed: int, parameters: dict[str, dict]) -> list[dict]:
+    from active6d_agent.ablation import PLANNING, ablate_planning
+    from active6d_bringup.cli.evaluate import usable_policies
+
+    usable_policies("view-attention", lookup.bank, parameters)
+    rows = []
+    with progress_bar() as bar:
+        task = bar.add_task("planning", total=2 + sum(map(len, PLANNING.values())))
+        own = parameters.get("view-attention")
+        for name, value, row in ablate_planning(lookup, starts, steps, seed=seed, parameters=own):
+            variant = name if value is None else f"{name} {value:g}"
+            rows.append({"variant": variant, "parameter": name, "value": value, **row})
+            bar.update(task, advance=1, description=variant)
+    return rows
+
+
+def _train_seeds(object_name: str, out: Path | None, steps: int, banks: Path | None) -> dict[tuple[str, int], Path]:
+    """Weights of every learned policy and seed; trains, as ``active6d train policy`` does, those that are not there."""
+    from active6d_agent.bank import cached_banks
+    from active6d_bringup.cli.policy_training import LEARNED, policy
+
+    folder = (out or cached_banks().parent / "policies") / object_name
+    found = {(name, seed): folder / name / f"seed{seed}" for name in LEARNED for seed in range(_SEEDS)}
+    for (name, seed), own in found.items():
+        if not (own / "best.safetensors").is_file():
+            policy(object_name, name, steps, out=own, banks=banks, seed=seed)
+    return {key: own / "best.safetensors" for key, own in found.items()}
+
+
+def _compare_seeds(
+    lookups: dict[str, "BankLookup"],
+    weights: dict[tuple[str, int], Path],
+    starts: Any,
+    steps: int,
+    sample: int | None,
+    seed: int,
+) -> list[dict]:
+    """Test figures of every training, its minutes, and which one is best on the same validation starts."""
+    import json
+
+    from active6d_agent.evaluation import Intervals, all_starts, describe, run_named
+    from active6d_agent.policy import shipped_weights
+
+    validation, intervals, rows = all_starts(lookups["val"], sample, seed), Intervals(starts[:, 0], seed), []
+    with progress_bar() as bar:
+        for (name, number), path in bar.track(weights.items(), description="evaluating"):
+            own = {"weights": str(path)}
+            chosen_on = run_named(lookups["val"], name, validation, steps, parameters=own)
+            results = run_named(lookups["test"], name, starts, steps, parameters=own)
+            shipped = shipped_weights(name, lookups["test"].model.name)
+            curve = (path.parent / "curve.jsonl").read_text().splitlines()
+            rows.append(
+                {
+                    "variant": f"{name}, seed {number}",
+                    "policy": name,
+                    "training_seed": number,
+                    "training_minutes": json.loads(curve[-1])["seconds"] / 60,
+                    "validation_detection_rate": float(chosen_on.detection_rate.mean()),
+                    "validation_e_add_mm": float(chosen_on.e_add_mm.mean()),
+                    "shipped": shipped.is_file() and shipped.read_bytes() == path.read_bytes(),
+                    **describe(results.measures, intervals),
+                }
+            )
+    for name in dict.fromkeys(row["policy"] for row in rows):
+        own = [row for row in rows if row["policy"] == name]
+        best = max(own, key=lambda row: (row["validation_detection_rate"], -row["validation_e_add_mm"]))
+        for row in own:
+            row["best_on_validation"] = row is best
     return rows
 
 
@@ -136,7 +233,8 @@ def _print(rows: list[dict], title: str) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, title=title)
-    columns = [key for key in rows[0] if not key.endswith("_ci95")]
+    hidden = ("against_first", "parameter", "value", "policy", "training_seed")
+    columns = [key for key in rows[0] if "_ci95" not in key and key not in hidden]
     for column in columns:
         table.add_column(column.replace("_", " "), justify="left" if column == "variant" else "right")
     for row in rows:
@@ -145,17 +243,37 @@ def _print(rows: list[dict], title: str) -> None:
 
 
 def _panels(part: Part, rows: list[dict]) -> list["Panel"]:
-    """Detection rate and e_ADD, and a third measure, over what is varied."""
+    """Detection rate and e_ADD, and a third measure, over what is varied; around them the interval over scenes."""
     from active6d_bringup.report.lines import Panel
 
+    if part is Part.PLANNING:
+        return _trade_offs(rows)
     third = ("reported", "hypotheses an object") if "reported" in rows[0] else ("distance_m", "d [m]")
+    line, x, x_label = {
+        Part.STEPS: ("variant", "budget", "T"),
+        Part.SEEDS: ("policy", "training_seed", "seed of the training"),
+    }.get(part, (None, "variant", part.value))
     panels = []
     for key, label in (("detection_rate", "detection rate"), ("e_add_mm", "e_ADD [mm]"), third):
         lines: dict[str, tuple] = {}
-        for variant in dict.fromkeys(row["variant"] for row in rows) if part is Part.STEPS else (label,):
-            own = [row for row in rows if part is not Part.STEPS or row["variant"] == variant]
-            x = [row["budget"] if part is Part.STEPS else row["variant"] for row in own]
-            interval = list(zip(*(row[f"{key}_ci95"] for row in own), strict=True))
-            lines[variant] = (x, [row[key] for row in own], interval)
-        panels.append(Panel("T" if part is Part.STEPS else part.value, label, lines))
+        for name in dict.fromkeys(row.get(line, label) for row in rows):
+            own = [row for row in rows if row.get(line, label) == name]
+            interval = list(zip(*(row[f"{key}_ci95_scenes"] for row in own), strict=True))
+            lines[name] = ([row[x] for row in own], [row[key] for row in own], interval)
+        panels.append(Panel(x_label, label, lines))
+    return panels
+
+
+def _trade_offs(rows: list[dict]) -> list["Panel"]:
+    """What metres and moves buy, one line a parameter."""
+    from active6d_bringup.report.lines import Panel
+
+    panels = []
+    for x, x_label in (("distance_m", "d [m]"), ("moves", "moves taken")):
+        for y, y_label in (("detection_rate", "detection rate"), ("e_add_mm", "e_ADD [mm]")):
+            lines = {}
+            for name in dict.fromkeys(row["parameter"] for row in rows):
+                own = [row for row in rows if row["parameter"] == name]
+                lines[name] = ([row[x] for row in own], [row[y] for row in own])
+            panels.append(Panel(x_label, y_label, lines))
     return panels

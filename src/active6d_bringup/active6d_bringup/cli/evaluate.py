@@ -15,6 +15,8 @@ ALL_POLICIES = (
     *("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score", "attention"),
     *("view-attention", "oracle", "all-views"),
 )
+#: What the others are compared with in a table of its own.
+_DEFAULT = "view-attention"
 Policies = Annotated[str, typer.Option(help="Names separated by commas, or all; oracle and all-views are bounds.")]
 Sample = Annotated[int | None, typer.Option(min=1, help="That many starts, drawn by --seed; all of them by default.")]
 
@@ -60,6 +62,8 @@ def evaluate(
         results = dict(running)
     summary = summarise(results, object_name, steps, seed)
     console.print(_table(summary))
+    if _DEFAULT in results and len(results) > 1:
+        console.print(_differences(summary))
     provenance = {"split": split, "seed": seed, "bank": bank.provenance, "parameters": parameters}
     write_json(json_file, {**summary, **provenance})
 
@@ -95,13 +99,13 @@ def usable_policies(text: str, bank: Any, parameters: dict[str, dict]) -> list[s
 def _table(summary: dict[str, Any]) -> "Table":
     from rich.table import Table
 
-    title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals)"
+    title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
     table = Table(box=None, pad_edge=False, title=title)
     table.add_column("policy", header_style="dim", no_wrap=True, min_width=max(map(len, summary["policies"])))
     for column in ("d [m]", "e_ADD [mm]", "", "detected", "", "gap closed"):
         table.add_column(column, justify="right", header_style="dim")
     for name, row in summary["policies"].items():
-        error, rate, gap = row["e_add_mm_ci95"], row["detection_rate_ci95"], row["gap_closed"]
+        error, rate, gap = row["e_add_mm_ci95_scenes"], row["detection_rate_ci95_scenes"], row["gap_closed"]
         table.add_row(
             name,
             f"{row['distance_m']:.2f}",
@@ -111,4 +115,22 @@ def _table(summary: dict[str, Any]) -> "Table":
             f"[dim]{rate[0]:.3f}-{rate[1]:.3f}[/dim]",
             "-" if gap is None else f"{gap:.0%}",
         )
+    return table
+
+
+def _differences(summary: dict[str, Any]) -> "Table":
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, title=f"{_DEFAULT} against the others, by the same starts")
+    against = summary["policies"][_DEFAULT]["against"]
+    table.add_column("against", header_style="dim", no_wrap=True, min_width=max(map(len, against)))
+    for column in ("d [m]", "e_ADD [mm]", "", "detected", ""):
+        table.add_column(column, justify="right", header_style="dim")
+    for name, measured in against.items():
+        cells = [f"{measured['distance_m']['mean']:+.2f}"]
+        for key, digits in (("e_add_mm", 2), ("detection_rate", 3)):
+            low, high = (f"{end:+.{digits}f}" for end in measured[key]["ci95_scenes"])
+            style = "bold" if measured[key]["excludes_zero_scenes"] else "dim"
+            cells += [f"[{style}]{measured[key]['mean']:+.{digits}f}[/]", f"[dim]{low} {high}[/dim]"]
+        table.add_row(name, *cells)
     return table
