@@ -109,7 +109,7 @@ def test_order_and_repetition_of_views_change_nothing(name, seed, order, again):
     assert_same(fusion.objects(last_stamp, T_world_camera, DEFAULT_CAMERA), expected)
 
 
-@pytest.mark.parametrize("rank_by", ["confidence", "verification", "score"])
+@pytest.mark.parametrize("rank_by", ["evidence", "confidence", "verification", "score"])
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_survivors_are_the_best_and_nothing_is_invented(rank_by, seed):
@@ -120,10 +120,14 @@ def test_survivors_are_the_best_and_nothing_is_invented(rank_by, seed):
     poses = np.concatenate([T @ hypotheses.T_camera_object for _, T, hypotheses, _ in episode])
     verification = np.concatenate([scores for *_, scores in episode])
     score = np.concatenate([hypotheses.score for _, _, hypotheses, _ in episode])
-    worth = {"verification": verification, "score": score, "confidence": (1 + verification) * score}[rank_by]
+    confidence = (1 + verification) * score
+    worth = {"verification": verification, "score": score}.get(rank_by, confidence)
     nearest = np.linalg.norm(poses[:, None, :3, 3] - truth[None, :, :3, 3], axis=-1).argmin(axis=1)
-    best = sorted((worth[nearest == index].max() for index in set(nearest)), reverse=True)
-    survivors = [np.flatnonzero(worth == value)[0] for value in best]
+    clusters = [np.flatnonzero(nearest == index) for index in sorted(set(nearest))]
+    rank = [(confidence[each] ** 2).sum() if rank_by == "evidence" else worth[each].max() for each in clusters]
+    survivors = [
+        each[worth[each].argmax()] for _, each in sorted(zip(rank, clusters, strict=True), key=lambda pair: -pair[0])
+    ]
     np.testing.assert_array_equal(objects.verification, verification[survivors])
     np.testing.assert_array_equal(objects.score, score[survivors])
     np.testing.assert_array_equal(objects.support, [np.sum(nearest == nearest[index]) for index in survivors])
@@ -179,10 +183,19 @@ def test_forgetting():
 
 
 def test_two_objects_cannot_share_a_place():
-    labels = np.array([0, 1, 0, 2, 3])
+    labels = np.array([0, 1, 0, 3, 4])
     positions = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0, 0], [0.03, 0, 0], [0.045, 0, 0]])
-    np.testing.assert_array_equal(select(labels, positions, 0.02), [0, 3])
-    np.testing.assert_array_equal(select(labels, positions, 0.0), [0, 1, 3, 4])
+    np.testing.assert_array_equal(select(labels, None, positions, 0.02), [0, 3])
+    np.testing.assert_array_equal(select(labels, None, positions, 0.0), [0, 1, 3, 4])
+
+
+def test_views_that_agree_outvote_a_surer_one():
+    labels = np.array([0, 1, 1, 3, 1])
+    weight = np.array([1.0, 0.4, 0.4, 0.1, 0.3])
+    positions = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.01, 0, 0], [0.2, 0, 0], [0.01, 0, 0]])
+    np.testing.assert_array_equal(select(labels, weight, positions, 0.02), [1, 3])
+    np.testing.assert_array_equal(select(labels, None, positions, 0.02), [0, 3])
+    np.testing.assert_array_equal(select(labels, weight, positions, 0.0), [1, 0, 3])
 
 
 @settings(max_examples=20, deadline=None)
@@ -209,7 +222,7 @@ def test_clusters_are_those_of_naive_agglomeration(seed):
 def test_bad_parameters_and_scores_are_named():
     with pytest.raises(ValueError, match="cut must be positive"):
         FusionParameters(cut=0.0)
-    with pytest.raises(ValueError, match="rank_by must be one of confidence, verification, score"):
+    with pytest.raises(ValueError, match="rank_by must be one of evidence, confidence, verification, score"):
         FusionParameters(rank_by="luck")
     with pytest.raises(ValueError, match="min_verification"):
         FusionParameters(min_verification=2.0)

@@ -18,7 +18,7 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.metrics import MISSED_E_ADD, SceneScore, score_errors
 from active6d_core.se3 import invert
 from active6d_perception.clustering import cluster_groups, suppress_neighbours
-from active6d_perception.fusion import FusionParameters, preference, project_features
+from active6d_perception.fusion import FusionParameters, evidence, preference, project_features
 from active6d_perception.model_views import model_views
 from active6d_perception.symmetric_distance import SymmetricDistance
 
@@ -32,11 +32,11 @@ class FusedBatch:
     """What fusion makes of the views of E episodes.
 
     Attributes:
-        objects: (E, n) rows of the accumulated objects, best verified first, -1 padding.
+        objects: (E, n) rows of the accumulated objects, best first, -1 padding.
         leaders: (E, n) the same as indices into ``members``, -1 padding.
         seen: (E, n) row of each object's best hypothesis in the current view, -1 without one.
         episode: (k,) episode of each member.
-        members: (k,) rows of all hypotheses of an episode's views, best verified first.
+        members: (k,) rows of all hypotheses of an episode's views, in fusion's order of preference.
         labels: (k,) the first member of each member's cluster, as an index into ``members``.
     """
 
@@ -73,6 +73,7 @@ class BankLookup:
         self.view = np.concatenate(views)
         self.positions = np.ascontiguousarray(self.T_world_object[:, :3, 3])
         self.verification, self.score, self.box, self.depth = table[:, 7], table[:, 8], table[:, 9:13], table[:, 13]
+        self._evidence = evidence(self.verification, self.score, self.parameters)
         self.errors = np.full((len(table), self.object_count.max()), np.inf, np.float32)
         for start, error in zip(self.first_row, errors, strict=False):
             self.errors[start : start + len(error), : error.shape[1]] = error
@@ -147,6 +148,9 @@ class BankLookup:
         rows = taken[episode, column]
         labels = self._cluster(episode, rows)
         leaders = np.flatnonzero(labels == np.arange(len(rows)))
+        if self._evidence is not None:
+            gathered = np.bincount(labels, self._evidence[rows])[leaders]
+            leaders = leaders[np.lexsort([-gathered, episode[leaders]])]
         number = np.bincount(episode[leaders], minlength=count)
         place = np.arange(len(leaders)) - (np.cumsum(number) - number)[episode[leaders]]
         table = np.full((count, number.max(initial=0)), -1)

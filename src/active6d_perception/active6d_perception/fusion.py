@@ -1,4 +1,4 @@
-"""Multi-view fusion: all hypotheses so far, clustered in the world; the best verified of each cluster is an object.
+"""Multi-view fusion: all hypotheses so far, clustered in the world; the best of each cluster is an object.
 
 :func:`cluster`, :func:`select` and :func:`project_features` are pure and know nothing of messages or history, so a
 training environment calls the same ones on precomputed tables. :class:`SceneFusion` keeps the history.
@@ -18,7 +18,7 @@ from active6d_perception.model_views import ModelViews, model_views
 from active6d_perception.symmetric_distance import SymmetricDistance
 
 #: Ways to rank hypotheses, see :attr:`FusionParameters.rank_by`.
-RANKINGS = ("confidence", "verification", "score")
+RANKINGS = ("evidence", "confidence", "verification", "score")
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,16 @@ class FusionParameters:
 
     Attributes:
         cut: clusters are cut where the distance between them exceeds this fraction of the diameter.
-        exclusion: of two objects whose origins are closer than this fraction of the diameter only the better verified
+        exclusion: of two objects whose origins are closer than this fraction of the diameter only the better one
             stays: solid objects cannot share their centre, but a pose that is ambiguous in some views (a mug with its
             handle hidden) puts several clusters there. 0 keeps all.
         min_verification: objects verified worse are not reported; the paper reports all, so -1 by default.
-        rank_by: which hypothesis of a cluster is best. ``verification`` is equation 1 alone, the paper's; ``score`` the
-            estimator's score; ``confidence`` the product of both: the score knows of what equation 1 cannot see, since
-            a mug fits its pixels whichever way its hidden handle points.
+        rank_by: which hypothesis of a cluster is best, and which of the clusters that claim one place. ``verification``
+            is equation 1 alone, the paper's; ``score`` the estimator's score; ``confidence`` the product of both: the
+            score knows of what equation 1 cannot see, since a mug fits its pixels whichever way its hidden handle
+            points. With these three a cluster is as good as its best hypothesis, so among many views one that is
+            wrong and sure of itself prevails. ``evidence`` takes the hypothesis of the highest confidence, and the
+            cluster whose squared confidences have the largest sum: views that agree outvote the one.
 
     Raises:
         ValueError: a value is out of range.
@@ -42,7 +45,7 @@ class FusionParameters:
     cut: float = 0.2
     exclusion: float = 0.2
     min_verification: float = -1.0
-    rank_by: str = "confidence"
+    rank_by: str = "evidence"
 
     def __post_init__(self) -> None:
         if not self.cut > 0:
@@ -55,18 +58,21 @@ class FusionParameters:
             raise ValueError(f"fusion: rank_by must be one of {', '.join(RANKINGS)}, got {self.rank_by!r}")
 
 
-def select(labels: np.ndarray, positions: np.ndarray, exclusion: float) -> np.ndarray:
+def select(labels: np.ndarray, weight: np.ndarray | None, positions: np.ndarray, exclusion: float) -> np.ndarray:
     """The best of each cluster that shares its place with no better one.
 
     Args:
-        labels: (k,) clusters of hypotheses in order of preference, best first.
+        labels: (k,) clusters of hypotheses in order of preference, best first; each named by its first.
+        weight: (k,) what each hypothesis adds to its cluster's evidence; None ranks clusters by their best.
         positions: (k, 3) metres.
         exclusion: metres.
 
     Returns:
         (n,) indices, best first.
     """
-    best = np.sort(np.unique(labels, return_index=True)[1])
+    best = np.flatnonzero(labels == np.arange(len(labels)))
+    if weight is not None:
+        best = best[np.argsort(-np.bincount(labels, weight)[best], kind="stable")]
     return best[suppress_neighbours(positions[best][None], np.ones((1, len(best)), bool), exclusion)[0]]
 
 
@@ -95,6 +101,16 @@ def summarise(
     return support, spread, np.where(current.any(axis=1), current.argmax(axis=1), -1)
 
 
+def confidence(verification: np.ndarray, score: np.ndarray) -> np.ndarray:
+    """(k,) from 0 to 2: equation 1, counted from -1, its least, times the estimator's score."""
+    return (1.0 + verification) * score
+
+
+def evidence(verification: np.ndarray, score: np.ndarray, parameters: FusionParameters) -> np.ndarray | None:
+    """(k,) what each hypothesis adds to its cluster's evidence; None where a cluster is as good as its best."""
+    return confidence(verification, score) ** 2 if parameters.rank_by == "evidence" else None
+
+
 def preference(
     verification: np.ndarray, score: np.ndarray, T_world_object: np.ndarray, parameters: FusionParameters
 ) -> np.ndarray:
@@ -109,10 +125,7 @@ def preference(
     Returns:
         (h,) indices, best first; ties by pose, so that the order of arrival never matters.
     """
-    # A score below zero must not change places when it is multiplied, so equation 1 counts from -1, its least.
-    worth = {"verification": verification, "score": score, "confidence": (1.0 + verification) * score}[
-        parameters.rank_by
-    ]
+    worth = {"verification": verification, "score": score}.get(parameters.rank_by, confidence(verification, score))
     entries = T_world_object[:, :3].reshape(len(verification), 12)
     order = np.lexsort([*entries.T, -worth])
     return order[verification[order] >= parameters.min_verification]
@@ -210,7 +223,7 @@ class SceneFusion:
         return True
 
     def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
-        """The accumulated objects, best verified first, with features in the camera of view ``stamp``.
+        """The accumulated objects, best first, with features in the camera of view ``stamp``.
 
         An object hypothesised in that view has the box and depth of its own mask there (of the best verified
         hypothesis in its cluster); for the others they are projected from the pose.
@@ -221,7 +234,8 @@ class SceneFusion:
         T, table, stamps = self._T_world_object[order], self._table[order], self._stamp[order]
         distance = self._distances[np.ix_(order, order)]
         labels = cluster(distance, self.parameters.cut * self._diameter)
-        chosen = select(labels, T[:, :3, 3], self.parameters.exclusion * self._diameter)
+        weight = evidence(table[:, 0], table[:, 1], self.parameters)
+        chosen = select(labels, weight, T[:, :3, 3], self.parameters.exclusion * self._diameter)
         box, depth = project_features(self._views, invert(T_world_camera) @ T[chosen], camera)
         support, spread, seen = summarise(labels, chosen, stamps, distance, stamp)
         box[seen >= 0], depth[seen >= 0] = table[seen[seen >= 0], 2:6], table[seen[seen >= 0], 6]

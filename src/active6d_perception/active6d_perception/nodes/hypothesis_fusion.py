@@ -61,7 +61,7 @@ class HypothesisFusionNode(GraphNode):
             rank_by=self.declare(
                 "rank_by",
                 FusionParameters.rank_by,
-                "what makes a hypothesis the best of its cluster: equation 1, the estimator's score, or both",
+                "what makes hypotheses and clusters the best: equation 1, the estimator's score, both, or their sum",
                 choices=RANKINGS,
             ),
         )
