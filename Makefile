@@ -1,6 +1,6 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint clean
+.PHONY: help setup demo results test lint clean
 
 BIN := .venv/bin
 DEMO := bags/demo
@@ -15,6 +15,9 @@ demo: setup  ## one episode on a heap of cups: a bag and a report in bags/demo
 	rm -rf $(DEMO)
 	$(BIN)/active6d episode --object coffee_cup --seed 7 --steps 5 --bag $(DEMO) --report $(DEMO)/report.html
 	@echo "Open $(DEMO)/report.html in a browser; the bag beside it opens in Foxglove, ros2 bag and rosbags."
+
+results: setup  ## what docs/results.md shows and is not measured yet, except trainings
+	$(BIN)/python scripts/reproduce_results.py
 
 test: setup  ## all tests
 	$(BIN)/python -m pytest tests
