@@ -58,6 +58,7 @@ def test_without_a_command_the_help_is_shown():
         (["episode", "--policy", "clever"], "--policy 'clever' is not among"),
         (["episode", "--estimator", "magic"], "--estimator 'magic' is not among"),
         (["episode", "--report", "x.html"], "--report needs --bag"),
+        (["episode", "--figure", "x.png"], "--figure needs --bag"),
         (["episode", "--set", "fusion"], "--set fusion: expected NODE.NAME=VALUE"),
         (["episode", "--set", "hypothesis_fusion.epsilon=[1"], "not YAML"),
         (["episode", "--params-file", "/nowhere.yaml"], "/nowhere.yaml does not exist"),

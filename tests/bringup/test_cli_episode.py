@@ -44,9 +44,9 @@ def run(capfd, monkeypatch):
 
 def test_episode_report_and_replay(tmp_path, run):
     bag, page, picture = tmp_path / "bag", tmp_path / "page.html", tmp_path / "picture.png"
-    told = tmp_path / "episode.json"
+    told, figure = tmp_path / "episode.json", tmp_path / "figure.png"
     stub = ("--object", "mug", "--seed", 4, "--policy", "random", "--steps", 2, "--estimator", "stub")
-    result = run("episode", *stub, "--bag", bag, "--report", page, "--json", told)
+    result = run("episode", *stub, "--bag", bag, "--report", page, "--figure", figure, "--json", told)
     assert result.exit_code == 0, result.stderr
     record = read_episode(bag)
     summary = json.loads(told.read_text())
@@ -61,10 +61,13 @@ def test_episode_report_and_replay(tmp_path, run):
     assert [line for line in result.stderr.splitlines() if line.startswith("view  2 at")]
     assert page.read_text().startswith("<!doctype html>")
 
-    again = run("report", bag, "--png", picture, "--json", tmp_path / "report.json")
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+    again = run("report", bag, "--png", picture, "--figure", tmp_path / "again.png", "--json", tmp_path / "report.json")
     assert again.exit_code == 0, again.stderr
     assert (bag / "report.html").read_text() == page.read_text()
     assert picture.read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "again.png").read_bytes() == figure.read_bytes()
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["distance_m"] == pytest.approx(summary["distance_m"])
     assert f"found {score.detected.sum()} of {len(score.detected)} objects" in again.stdout

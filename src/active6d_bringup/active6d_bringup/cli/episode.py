@@ -37,6 +37,12 @@ def episode(
     report: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the HTML report of the bag; needs --bag.")
     ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Draw before and after, attention against scores, and the path; needs --bag."
+        ),
+    ] = None,
     processes: Processes = False,
     params_file: ParamsFile = None,
     override: Overrides = None,
@@ -46,8 +52,9 @@ def episode(
 
     Example: [bold]active6d episode --object mug --seed 7 --policy lowest-score --steps 5 --bag bags/mug[/bold]
     """
-    if report is not None and bag is None:
-        raise ValueError("--report needs --bag, because the report is made from what was recorded")
+    if bag is None and (report is not None or figure is not None):
+        option = "--report" if report is not None else "--figure"
+        raise ValueError(f"{option} needs --bag, because it is made from what was recorded")
     with messages.status("starting"):
         from active6d_bringup.episode import EpisodeSettings
 
@@ -68,12 +75,12 @@ def episode(
     result = _run(settings)
     summary = _summary(result)
     _print_summary(result, summary)
-    if report is not None:
+    if report is not None or figure is not None:
         from active6d_bringup.bag import read_episode
         from active6d_bringup.cli.report import write_reports
         from active6d_bringup.report.analysis import analyse
 
-        write_reports(analyse(read_episode(bag)), report)
+        write_reports(analyse(read_episode(bag)), report, figure=figure)
     write_json(json_file, summary)
 
 

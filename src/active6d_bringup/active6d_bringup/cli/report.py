@@ -5,7 +5,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_bringup.cli.output import BagFolder, BagObject, JsonFile, console, messages, write_file, write_json
+from active6d_bringup.cli.output import (
+    BagFolder,
+    BagObject,
+    JsonFile,
+    console,
+    messages,
+    write_file,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from active6d_bringup.report.analysis import EpisodeAnalysis
@@ -16,14 +24,19 @@ def report(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="The HTML file; DIR/report.html by default.")
     ] = None,
-    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the episode as one picture, too.")] = None,
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the views and how the score rose, as one picture.")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw before and after, attention against scores, and the path.")
+    ] = None,
     object_name: BagObject = None,
     episode: Annotated[int, typer.Option(min=0, help="Which episode of a bag with several, from 0.")] = 0,
     json_file: JsonFile = None,
 ) -> None:
     """Make one self-contained HTML file of a recorded episode, and say the same in short here.
 
-    Example: [bold]active6d report bags/mug -o mug.html --png mug.png[/bold]
+    Example: [bold]active6d report bags/mug -o mug.html --figure mug.png[/bold]
     """
     from active6d_bringup.bag import read_episodes
     from active6d_bringup.report.analysis import analyse
@@ -33,27 +46,27 @@ def report(
         if episode >= len(records):
             raise ValueError(f"--episode {episode}: {folder} holds {len(records)}, counted from 0")
         analysis = analyse(records[episode], object_name)
-    write_reports(analysis, output or folder / "report.html", png)
+    write_reports(analysis, output or folder / "report.html", png, figure)
     print_summary(analysis)
     write_json(json_file, analysis.summary())
 
 
-def write_reports(analysis: "EpisodeAnalysis", html: Path, png: Path | None = None) -> None:
-    """Write the HTML page and, with a path for it, the picture.
+def write_reports(
+    analysis: "EpisodeAnalysis", html: Path | None = None, png: Path | None = None, figure: Path | None = None
+) -> None:
+    """Write what has a path: the HTML page, the picture of all views, the figure of before, after and attention.
 
     Raises:
         OSError: a file cannot be written.
     """
+    from active6d_bringup.report.figure import render_png
     from active6d_bringup.report.page import render_html
+    from active6d_bringup.report.qualitative import render_qualitative
 
-    with messages.status("drawing the report"):
-        write_file(html, render_html(analysis))
-        if png is not None:
-            from active6d_bringup.report.figure import render_png
-
-            write_file(png, render_png(analysis))
-    for path in (html, png):
+    for path, render in ((html, render_html), (png, render_png), (figure, render_qualitative)):
         if path is not None:
+            with messages.status(f"drawing {path.name}"):
+                write_file(path, render(analysis))
             messages.print(f"wrote {path}", highlight=False, markup=False)
 
 
