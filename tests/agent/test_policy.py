@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 
 from active6d_agent import baselines
 from active6d_agent import policy as policy_module
-from active6d_agent.policy import choose_policy, create_policy, list_policies, softmax, uniform_attention
+from active6d_agent.policy import (
+    choose_policy,
+    create_policy,
+    list_policies,
+    shipped_weights,
+    softmax,
+    uniform_attention,
+)
 from active6d_core.view_sphere import ViewSphere
 
 SPHERE = ViewSphere()
@@ -247,3 +254,10 @@ def test_auto_is_the_learned_policy_where_its_weights_ship(model, tmp_path, monk
     (tmp_path / "view-attention_mug.safetensors").touch()
     assert choose_policy("mug") == "view-attention"
     assert choose_policy("bunny") == "lowest-score"
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "view-attention_bunny.safetensors").touch()
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(mine))
+    assert choose_policy("bunny") == "view-attention"
+    assert shipped_weights("view-attention", "bunny") == mine / "view-attention_bunny.safetensors"
+    assert shipped_weights("view-attention", "mug") == tmp_path / "view-attention_mug.safetensors"

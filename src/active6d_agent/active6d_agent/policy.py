@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from active6d_core.hypotheses import SceneObjects
-from active6d_core.object_model import ObjectModel
+from active6d_core.object_model import ObjectModel, find_beside
 from active6d_core.registry import Registry
 from active6d_core.view_sphere import ViewSphere
 
@@ -105,12 +105,12 @@ class Policy(Protocol):
 
 
 def shipped_weights(policy: str, object_name: str) -> Path:
-    """Where the shipped weights of a policy for an object are, or would be."""
-    return SHIPPED_WEIGHTS / f"{policy}_{object_name}.safetensors"
+    """Where weights of a policy for an object are, or would be: beside its description, or where shipped ones are."""
+    return find_beside(f"{policy}_{object_name}.safetensors", SHIPPED_WEIGHTS)
 
 
 def choose_policy(object_name: str) -> str:
-    """What ``auto`` stands for: the learned policy where weights ship for the object, else the best heuristic."""
+    """What ``auto`` stands for: the learned policy where there are weights for the object, else the best heuristic."""
     return "view-attention" if shipped_weights("view-attention", object_name).is_file() else "lowest-score"
 
 

@@ -146,6 +146,12 @@ def search_folders() -> list[Path]:
     return [Path(folder) for folder in extra.split(os.pathsep) if folder] + [SHIPPED_OBJECTS]
 
 
+def find_beside(file_name: str, shipped: Path) -> Path:
+    """A file that goes with an object: beside the descriptions if it is there, else in ``shipped``, there or not."""
+    beside = (folder / file_name for folder in search_folders())
+    return next((path for path in beside if path.is_file()), shipped / file_name)
+
+
 def _load_mesh(description: dict, path: Path) -> trimesh.Trimesh:
     """The mesh of ``mesh`` (a file) or ``profile`` ((r, z) rows revolved about z), scaled, origin at its centroid."""
     if ("mesh" in description) == ("profile" in description):

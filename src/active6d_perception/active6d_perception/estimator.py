@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
-from active6d_core.object_model import ObjectModel, search_folders
+from active6d_core.object_model import ObjectModel, find_beside
 from active6d_core.registry import Registry
 
 #: Networks of the learned estimator that come with this package.
@@ -30,8 +30,7 @@ def choose_estimator(object_name: str) -> str:
 
 def weights_path(object_name: str) -> Path:
     """The object's network: beside its description if it is one that was added, else where shipped ones are."""
-    beside = [folder / f"{object_name}.safetensors" for folder in search_folders()]
-    return next((path for path in beside if path.is_file()), SHIPPED_WEIGHTS / f"{object_name}.safetensors")
+    return find_beside(f"{object_name}.safetensors", SHIPPED_WEIGHTS)
 
 
 _registry = Registry(
