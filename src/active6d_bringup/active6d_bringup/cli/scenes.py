@@ -9,6 +9,7 @@ from active6d_bringup.cli.output import (
     JsonFile,
     ObjectName,
     Seed,
+    command_group,
     console,
     messages,
     progress_bar,
@@ -16,7 +17,7 @@ from active6d_bringup.cli.output import (
     write_json,
 )
 
-app = typer.Typer(help="Stored scenes: generate, report, show.", rich_markup_mode="rich")
+app = command_group("Stored scenes: generate, report, show.")
 
 
 @app.command()

@@ -10,9 +10,17 @@ from typing import Annotated, Any
 
 import typer
 
-from active6d_bringup.cli.output import JsonFile, ObjectName, Seed, export_weights, progress_bar, write_json
+from active6d_bringup.cli.output import (
+    JsonFile,
+    ObjectName,
+    Seed,
+    command_group,
+    export_weights,
+    progress_bar,
+    write_json,
+)
 
-app = typer.Typer(help="Train what is learned.", no_args_is_help=True)
+app = command_group("Train what is learned.")
 
 _DATA = "Folder for training views and the training's state; by default active6d/training/OBJECT in the cache folder."
 
@@ -64,7 +72,7 @@ def _options(steps: int, batch: int, seed: int) -> Any:
 
 def _render_missing(object_name: str, folder: Path, heaps: int, views: int, cores: int) -> dict[str, list[Path]]:
     """Paths of all files of training and validation views; those that are not there yet are rendered on all cores."""
-    from active6d_sim.scene_store import SPLITS
+    from active6d_sim.scene_store import SPLITS, load_scene
     from active6d_sim.training_views import FIRST_SEED
 
     tasks: dict[Path, tuple[Callable, tuple]] = {}
@@ -76,6 +84,7 @@ def _render_missing(object_name: str, folder: Path, heaps: int, views: int, core
         tasks[path] = (render_training, (object_name, seed, views, path))
     missing = [path for path in tasks if not path.is_file()]
     if missing:
+        load_scene(object_name, "val", 0)  # says how to make the stored scenes where they are missing
         for parent in {path.parent for path in missing}:
             parent.mkdir(parents=True, exist_ok=True)
         # Threads do not survive a fork, and the ray caster and the network library have some.
