@@ -95,26 +95,30 @@ def draw_path(axes: Axes, analysis: EpisodeAnalysis, colors: list[str]) -> None:
     axes.scatter(
         *(centers[nearest_last] @ plane).T, s=70, c=shades, edgecolors="white", linewidths=0.6, label="objects"
     )
-    for start, end in pairwise(cameras):
-        _draw_line(axes, _arc(start, end, sphere.radius), projection, color=ACCENT, lw=2.2)
+    arcs = [_arc(start, end, sphere.radius) for start, end in pairwise(cameras)]
+    for arc in arcs:
+        _draw_line(axes, arc, projection, color=ACCENT, lw=2.2)
     for number, position in enumerate(cameras @ plane):
         fill, ink = (ACCENT, "white") if number == len(cameras) - 1 else ("white", ACCENT)
         circle = {"boxstyle": "circle,pad=0.28", "facecolor": fill, "edgecolor": ACCENT}
         axes.text(*position, str(number), size=8, weight="bold", color=ink, ha="center", va="center", bbox=circle)
-    if len(cameras) > 1:
-        _name_ends(axes, cameras @ plane)
+    if arcs:
+        _name_ends(axes, cameras @ plane, np.concatenate(arcs) @ plane)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.09)
     axes.set_axis_off()
 
 
-def _name_ends(axes: Axes, path: np.ndarray) -> None:
-    """Words at the first and last of (t, 2) points of the drawing, on the side that the path does not go to."""
-    style = {"size": 8, "color": ACCENT, "ha": "center", "va": "center"}
+def _name_ends(axes: Axes, cameras: np.ndarray, path: np.ndarray) -> None:
+    """Words beside the first and last of (t, 2) cameras in the drawing, on the side farthest from the (n, 2) path."""
+    angles = np.arange(16) * np.pi / 8
+    around = np.stack([1.5 * np.cos(angles), np.sin(angles)], axis=1)
+    size = 0.16 * np.ptp(path, axis=0).max()
+    style = {"size": 8, "color": ACCENT, "ha": "center", "va": "center", "textcoords": "offset points"}
     halo = [withStroke(linewidth=2.5, foreground="white")]
-    for word, end, inward in (("start", path[0], path[1]), ("end", path[-1], path[-2])):
-        away = (end - inward) / max(float(np.linalg.norm(end - inward)), 1e-9)
-        axes.annotate(word, end, (24, 15) * away, textcoords="offset points", path_effects=halo, **style)
+    for word, camera in (("start", cameras[0]), ("end", cameras[-1])):
+        gaps = np.linalg.norm((camera + size * around)[:, None] - path, axis=-1).min(axis=1)
+        axes.annotate(word, camera, 16 * around[np.argmax(gaps)], path_effects=halo, **style)
 
 
 def clearest_projection(sphere: ViewSphere, cameras: np.ndarray) -> np.ndarray:
