@@ -259,21 +259,25 @@ def _panels(part: Part, rows: list[dict]) -> list["Panel"]:
         for name in dict.fromkeys(row.get(line, label) for row in rows):
             own = [row for row in rows if row.get(line, label) == name]
             interval = list(zip(*(row[f"{key}_ci95_scenes"] for row in own), strict=True))
-            lines[name] = ([row[x] for row in own], [row[key] for row in own], interval)
+            # As text, so that few views have as much room as many.
+            lines[name] = ([str(row[x]) for row in own], [row[key] for row in own], interval)
         panels.append(Panel(x_label, label, lines))
     return panels
 
 
 def _trade_offs(rows: list[dict]) -> list["Panel"]:
-    """What metres and moves buy, one line a parameter."""
+    """What metres and moves buy."""
     from active6d_bringup.report.lines import Panel
 
     panels = []
-    for x, x_label in (("distance_m", "d [m]"), ("moves", "moves taken")):
-        for y, y_label in (("detection_rate", "detection rate"), ("e_add_mm", "e_ADD [mm]")):
-            lines = {}
-            for name in dict.fromkeys(row["parameter"] for row in rows):
-                own = [row for row in rows if row["parameter"] == name]
-                lines[name] = ([row[x] for row in own], [row[y] for row in own])
-            panels.append(Panel(x_label, y_label, lines))
+    for x, x_label, y, y_label in (
+        ("distance_m", "d [m]", "detection_rate", "detection rate"),
+        ("distance_m", "d [m]", "e_add_mm", "e_ADD [mm]"),
+        ("moves", "moves taken", "detection_rate", "detection rate"),
+    ):
+        lines = {}
+        for name in ("metres_weight", "stop_below", "as shipped", "random"):
+            own = [row for row in rows if row["parameter"] == name]
+            lines[name] = ([row[x] for row in own], [row[y] for row in own])
+        panels.append(Panel(x_label, y_label, lines))
     return panels

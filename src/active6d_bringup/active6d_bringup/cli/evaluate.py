@@ -102,7 +102,7 @@ def _table(summary: dict[str, Any]) -> "Table":
     title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
     table = Table(box=None, pad_edge=False, title=title)
     table.add_column("policy", header_style="dim", no_wrap=True, min_width=max(map(len, summary["policies"])))
-    for column in ("d [m]", "e_ADD [mm]", "", "detected", "", "gap closed"):
+    for column in ("d, m", "e_ADD, mm", "", "detected", "", "gap closed"):
         table.add_column(column, justify="right", header_style="dim")
     for name, row in summary["policies"].items():
         error, rate, gap = row["e_add_mm_ci95_scenes"], row["detection_rate_ci95_scenes"], row["gap_closed"]
@@ -124,7 +124,7 @@ def _differences(summary: dict[str, Any]) -> "Table":
     table = Table(box=None, pad_edge=False, title=f"{_DEFAULT} against the others, by the same starts")
     against = summary["policies"][_DEFAULT]["against"]
     table.add_column("against", header_style="dim", no_wrap=True, min_width=max(map(len, against)))
-    for column in ("d [m]", "e_ADD [mm]", "", "detected", ""):
+    for column in ("d, m", "e_ADD, mm", "", "detected", ""):
         table.add_column(column, justify="right", header_style="dim")
     for name, measured in against.items():
         cells = [f"{measured['distance_m']['mean']:+.2f}"]

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from active6d_bringup.report.results_tables import MEASURES, interval, number, table
+from active6d_bringup.report.results_tables import MEASURES, interval, number, percent, table
 
 #: What an object's commands wrote, by the name of the command in :mod:`active6d_bringup.report.results_page`.
 Measured = Mapping[str, dict[str, Any]]
@@ -57,7 +57,9 @@ def beats(report: dict[str, Any], name: str, others: Iterable[str], keys: Sequen
     won = [ahead and difference["excludes_zero"] for _, ahead, difference, _ in leads]
     surely = [ahead and difference["excludes_zero_scenes"] for _, ahead, difference, _ in leads]
     least = min(leads, key=lambda lead: lead[0])[3]
-    return Verdict(all(won), f"least {least}", "over starts, not over scenes" if all(won) and not all(surely) else "")
+    return Verdict(
+        all(won), f"at worst {least}", "over starts, not over scenes" if all(won) and not all(surely) else ""
+    )
 
 
 def _no_farther(own: Measured) -> Verdict:
@@ -70,7 +72,7 @@ def _gap(own: Measured) -> Verdict:
     closed = own["evaluate"]["policies"][DEFAULT]["gap_closed"]
     if closed is None:
         raise KeyError("oracle")
-    return Verdict(closed >= 0.6, f"{closed:.0%}", "and the aim" if closed >= 0.8 else "")
+    return Verdict(closed >= 0.6, percent(closed), "and the aim" if closed >= 0.8 else "")
 
 
 def _five_like_ten(own: Measured) -> Verdict:
@@ -87,7 +89,7 @@ def _attention_learned(own: Measured) -> Verdict:
     lowest = own["attention"]["rows"][1]
     against = lowest["against_first"]
     found, error = against["detection_rate"], against["e_add_mm"]
-    told = f"{number(-found['mean'], 3, True)} found, e_ADD {-error['mean'] / lowest['e_add_mm']:+.0%}"
+    told = f"{number(-found['mean'], 3, True)} found, e_ADD {percent(-error['mean'] / lowest['e_add_mm'], True)}"
     met = found["mean"] < 0 < error["mean"] and found["excludes_zero"] and error["excludes_zero"]
     surely = found["excludes_zero_scenes"] and error["excludes_zero_scenes"]
     return Verdict(met, told, "over starts, not over scenes" if met and not surely else "")
@@ -145,7 +147,7 @@ GOALS: dict[str, Callable[[Measured], Verdict]] = {
 def _saturates(own: Measured) -> Verdict:
     found = {row["budget"]: row["detection_rate"] for row in own["steps"]["rows"] if row["variant"] == "random"}
     share = (found[10] - found[0]) / (found[99] - found[0])
-    return Verdict(share >= 0.9, f"`random` has {share:.0%} of the gain of all views at T = 10")
+    return Verdict(share >= 0.9, f"`random` has {percent(share)} of the gain of all views at T = 10")
 
 
 def _too_much_closeness(own: Measured) -> Verdict:

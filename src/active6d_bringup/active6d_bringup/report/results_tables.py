@@ -18,7 +18,8 @@ MEASURES = {
     "moves": (" moves", 1, 0),
     "reported": (" an object", 2, 0),
 }
-#: Table 1 of the paper: metres, e_ADD in mm, detection rate.
+PAPER_STEPS = 5
+#: Table 1 of the paper, after five moves: metres, e_ADD in mm, detection rate.
 PAPER = {
     "coffee_cup": {
         "random": (4.97, 13.48, 0.76),
@@ -47,6 +48,11 @@ def number(value: float, digits: int, sign: bool = False) -> str:
     return text.replace("0.", ".", 1) if abs(value) < 1 and digits == 3 else text
 
 
+def percent(share: float, sign: bool = False) -> str:
+    """A share in hundredths."""
+    return f"{100 * share:{'+' if sign else ''}.0f} %"
+
+
 def interval(ends: Sequence[float], digits: int, sign: bool = False) -> str:
     """Two ends in brackets."""
     return f"({' to '.join(number(end, digits, sign) for end in ends)})"
@@ -65,7 +71,7 @@ def mark(difference: dict[str, Any], better: int) -> str:
 
 def policies_table(report: dict[str, Any]) -> str:
     """The paper's Table 1, with intervals over scenes, bounds, and the paper's numbers where it has any."""
-    paper = PAPER.get(report["object"], {})
+    paper = PAPER.get(report["object"], {}) if report["steps"] == PAPER_STEPS else {}
     header = ["policy", "d, m", "e_ADD, mm", "detection rate", "gap closed"]
     rows = []
     for name, row in report["policies"].items():
@@ -73,7 +79,7 @@ def policies_table(report: dict[str, Any]) -> str:
         for key in ("e_add_mm", "detection_rate"):
             digits = MEASURES[key][1]
             cells.append(f"{number(row[key], digits)} {interval(row[f'{key}_ci95_scenes'], digits)}")
-        cells.append("" if row["gap_closed"] is None else f"{row['gap_closed']:.0%}")
+        cells.append("" if row["gap_closed"] is None else percent(row["gap_closed"]))
         if paper:
             metres, error, rate = paper.get(name, (None, None, None))
             cells.append("" if rate is None else f"{metres:.2f} m, {error:.2f} mm, {rate:.2f}")
