@@ -137,20 +137,24 @@ class ViewAttention(nn.Module):
         present = state["present"]
         objects, pairs, views = self.describe(state)
         h = self.of_object(objects)
-        count = present.sum(dim=1).clamp(min=1)[:, None]
-        pooled = (h * present[..., None]).sum(dim=1) / count
+        mask = present.to(h.dtype)
+        number = mask.sum(dim=1, keepdim=True)
+        count = number.clamp(min=1)
+        pooled = (h * mask[..., None]).sum(dim=1) / count
         h = self.in_context(torch.cat([h, pooled[:, None].expand_as(h)], dim=-1))
-        together = self.of_pair(pairs) + self.pair_from_object(h)[:, None] + self.pair_from_view(views)[:, :, None]
-        e = torch.relu(together)
-        e = (e + self.mix(e)) * present[:, None, :, None]
-        logits = self.attend(e)[..., 0].masked_fill(~present[:, None], -1e9)
-        attention = torch.softmax(logits, dim=-1) * present[:, None]
-        attended = (attention[:, :, None] @ e)[:, :, 0]
-        # Gains of different objects add up; what nobody has seen yet is for the view as a whole to say.
-        gains = (self.per_object(e) * present[:, None, :, None]).sum(dim=2)
-        mean = e.sum(dim=2) / count[:, None]
-        whole = torch.cat([attended, mean, pooled[:, None].expand_as(attended), views], dim=-1)
-        gains = gains + self.per_view(whole)
+        # Passes over (B, M, n, hidden) are what costs: sums are in place, and masks in the weights of sums.
+        e = self.of_pair(pairs)
+        e += self.pair_from_object(h)[:, None]
+        e += self.pair_from_view(views)[:, :, None]
+        e = e.relu_()
+        e = e + self.mix(e)
+        logits = self.attend(e)[..., 0].masked_fill_(~present[:, None], -1e9)
+        attention = torch.softmax(logits, dim=-1) * mask[:, None]
+        attended, total = (torch.stack([attention, mask[:, None].expand_as(attention)], dim=2) @ e).unbind(dim=2)
+        whole = torch.cat([attended, total / count[..., None], pooled[:, None].expand_as(total), views], dim=-1)
+        # Gains of different objects add up, each a linear function of its features, so they are had from the sum of
+        # those. What nobody has seen yet is for the view as a whole to say.
+        gains = total @ self.per_object.weight.T + (number * self.per_object.bias)[:, None] + self.per_view(whole)
         more = (state["left"] > 1)[:, None, None]
         return gains[..., :GAINS], gains[..., GAINS:] * more, attention
 
@@ -160,48 +164,50 @@ class ViewAttention(nn.Module):
         pose, present, taken, grid = state["pose"], state["present"], state["taken"], state["views"]
         rotation, centre = pose[..., :3], pose[..., 3]
         B, M = len(pose), len(grid)
-        radius = torch.linalg.vector_norm(taken[:, -1], dim=-1)[:, None, None]
-        cameras = torch.cat([grid.expand(B, M, 3), taken], dim=1)
-        rays = cameras[:, :, None] - centre[:, None]
-        distance = torch.linalg.vector_norm(rays, dim=-1)
-        rays = rays / distance[..., None].clamp(min=1e-6)
-        free, clear = self._sight(rays, centre, present)
-        new, old = rays[:, :M], rays[:, M:]
-        turned = (new.transpose(1, 2) @ old.permute(0, 2, 3, 1)).permute(0, 2, 3, 1)
-        closest = turned.amax(dim=2).clamp(-1.0, 1.0)
-        seen_there = (free[:, None, M:] * (1.0 + turned) / 2).amax(dim=2)
-        sides = self._sides((new.transpose(1, 2) @ rotation).transpose(1, 2))
-        outward = centre[..., :2] / torch.linalg.vector_norm(centre[..., :2], dim=-1, keepdim=True).clamp(min=1e-6)
-        ahead = -torch.nn.functional.normalize(grid, dim=-1)
-        columns = [
-            free[:, :M],
-            clear[:, :M],
-            new[..., 2],
-            torch.acos(closest * 0.999999) / np.pi,
-            closest,
-            seen_there,
-            distance[:, :M] / radius - 1.0,
-            (new[..., :2] * outward[:, None]).sum(dim=-1),
-            -(new * ahead[None, :, None]).sum(dim=-1) - 0.95,
-        ]
-        pairs = torch.cat([torch.stack(columns, dim=-1), sides], dim=-1)
-        objects = self._describe_objects(state, free[:, M:].amax(dim=1), clear[:, -1])
-        return objects, pairs, self._describe_views(state, radius[:, 0])
-
-    def _sight(self, rays: torch.Tensor, centre: torch.Tensor, present: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """How free (B, K, n, 3) rays from objects to cameras are past the other objects: (B, K, n) twice, once for
-        balls with the diameter and once for their cores."""
+        radius = torch.linalg.vector_norm(taken, dim=-1, keepdim=True)
+        outlook, headings = grid / torch.linalg.vector_norm(grid, dim=-1, keepdim=True), taken / radius
+        # Cameras last, (B, n, 3, K), so that everything between objects and cameras is one long row after another.
+        cameras = torch.cat([grid.expand(B, M, 3), taken], dim=1).transpose(1, 2)
+        rays = cameras[:, None] - centre[..., None]
+        distance = torch.linalg.vector_norm(rays, dim=2)
+        rays /= distance.clamp(min=1e-6)[:, :, None]
         apart = (centre[:, None] - centre[:, :, None]) / self.diameter
         square = (apart**2).sum(dim=-1)
-        hides = present[:, None, :] & (square > _SAME_OBJECT**2)
-        # From here on (B, n, K, n), the object whose sight it is first, so that everything stays contiguous.
-        along = rays.transpose(1, 2) @ apart.transpose(2, 3)
+        free, clear = self._sight(rays, apart, square, present)
+        new, seen_then = rays[..., :M], free[..., M:]
+        from_axis = torch.linalg.vector_norm(centre[..., :2], dim=-1)
+        outward = centre[..., None, :2] / from_axis.clamp(min=1e-6)[..., None, None]
+        turned = rays[..., M:].transpose(2, 3) @ new
+        closest = turned.amax(dim=2).clamp_(-1.0, 1.0)
+        columns = [
+            free[..., :M],
+            clear[..., :M],
+            new[:, :, 2],
+            torch.acos(closest * 0.999999) / np.pi,
+            closest,
+            (seen_then[..., None] * (1.0 + turned)).amax(dim=2) / 2,
+            distance[..., :M] / radius[:, -1:] - 1.0,
+            (outward @ new[:, :, :2])[:, :, 0],
+            (new * outlook.T).sum(dim=2) - 0.95,
+            *self._sides((rotation.transpose(2, 3) @ new).movedim(2, -1)).unbind(dim=-1),
+        ]
+        pairs = torch.stack(columns, dim=2).permute(0, 3, 1, 2).contiguous()
+        sights = seen_then.amax(dim=2), clear[..., -1]
+        objects = self._describe_objects(state, apart, square, from_axis, sights)
+        return objects, pairs, self._describe_views(state, outlook, headings)
+
+    def _sight(
+        self, rays: torch.Tensor, apart: torch.Tensor, square: torch.Tensor, present: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """How free (B, n, 3, K) rays from objects to cameras are past the other objects: (B, n, K) twice, once for
+        balls with the diameter and once for their cores."""
+        hides = (square > _SAME_OBJECT**2) & present[:, None]
+        # (B, n, n, K), the object whose sight it is first, then the one that may hide it.
+        along = apart @ rays
+        beside = torch.addcmul(torch.where(hides, square, np.inf)[..., None], along, along, value=-1.0)
+        beside = torch.where(along > 0, beside, 1.0).clamp_(0.0, 1.0)
         # Roots are drawn of the products, which are fewer.
-        beside = torch.addcmul(square[:, :, None], along, along, value=-1.0).clamp(min=0.0)
-        beside = beside.masked_fill(~(hides[:, :, None] & (along > 0)), 1.0)
-        free = beside.clamp(max=1.0).prod(dim=-1).sqrt()
-        clear = (4 * beside).clamp(max=1.0).prod(dim=-1).sqrt()
-        return free.transpose(1, 2), clear.transpose(1, 2)
+        return beside.prod(dim=2).sqrt_(), (4 * beside).clamp_(max=1.0).prod(dim=2).sqrt_()
 
     def _sides(self, directions: torch.Tensor) -> torch.Tensor:
         """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
@@ -211,39 +217,39 @@ class ViewAttention(nn.Module):
         return torch.stack([axial, (1 - axial**2).clamp(min=0.0).sqrt(), torch.zeros_like(axial)], dim=-1)
 
     def _describe_objects(
-        self, state: dict[str, torch.Tensor], best_sight: torch.Tensor, sight_now: torch.Tensor
+        self,
+        state: dict[str, torch.Tensor],
+        apart: torch.Tensor,
+        square: torch.Tensor,
+        from_axis: torch.Tensor,
+        sights: tuple[torch.Tensor, torch.Tensor],
     ) -> torch.Tensor:
-        pose, scalars, present = state["pose"], state["scalars"], state["present"]
-        centre = pose[..., 3] / self.diameter
-        up = self._sides(pose[..., 2, :3])
-        apart = centre[:, None] - centre[:, :, None]
-        near = torch.exp(-(apart**2).sum(dim=-1)) * present[:, None]
-        above = (near * apart[..., 2].clamp(min=0.0)).sum(dim=-1)
+        pose, present = state["pose"], state["present"]
+        verification, score, spread, support = state["scalars"].unbind(dim=-1)
+        near = torch.exp(-square) * present[:, None]
         columns = [
-            scalars[..., 0],
-            scalars[..., 1],
-            (scalars[..., 2] / self.diameter).clamp(max=1.0),
-            scalars[..., 3],
-            centre[..., 2],
-            torch.linalg.vector_norm(centre[..., :2], dim=-1) / 2,
+            verification,
+            score,
+            (spread / self.diameter).clamp_(max=1.0),
+            support,
+            pose[..., 2, 3] / self.diameter,
+            from_axis / (2 * self.diameter),
             near.sum(dim=-1) / 3,
-            above,
-            best_sight,
-            sight_now,
-            (state["moves"] / 5).clamp(max=2.0)[:, None].expand_as(best_sight),
+            (near * apart[..., 2].clamp(min=0.0)).sum(dim=-1),
+            *sights,
+            (state["moves"] / 5).clamp_(max=2.0)[:, None].expand_as(score),
+            *self._sides(pose[..., 2, :3]).unbind(dim=-1),
         ]
-        return torch.cat([torch.stack(columns, dim=-1), up], dim=-1)
-
-    def _describe_views(self, state: dict[str, torch.Tensor], radius: torch.Tensor) -> torch.Tensor:
-        grid = torch.nn.functional.normalize(state["views"], dim=-1)
-        taken = torch.nn.functional.normalize(state["taken"], dim=-1)
-        arcs = torch.acos((grid @ taken.transpose(1, 2)).clamp(-1, 1) * 0.999999) / np.pi
-        height, level = grid[:, 2].expand(arcs.shape[:2]), taken[:, -1, 2:3].expand(arcs.shape[:2])
-        moves = (state["moves"] / 5).clamp(max=2.0)[:, None].expand_as(height)
-        left = (state["left"] / 5).clamp(max=2.0)[:, None].expand_as(height)
-        count = (state["present"].sum(dim=1) / 20.0)[:, None].expand_as(height)
-        columns = [height, level, arcs[..., -1], arcs.amin(dim=-1), moves, left, count, 1.0 / (1.0 + 5 * left)]
         return torch.stack(columns, dim=-1)
+
+    def _describe_views(
+        self, state: dict[str, torch.Tensor], outlook: torch.Tensor, headings: torch.Tensor
+    ) -> torch.Tensor:
+        arcs = torch.acos((outlook @ headings.transpose(1, 2)).clamp_(-1, 1).mul_(0.999999)) / np.pi
+        moves, left = (torch.stack([state["moves"], state["left"]]) / 5).clamp_(max=2.0)
+        of_state = [headings[:, -1, 2], moves, left, state["present"].sum(dim=1) / 20.0, 1.0 / (1.0 + 5 * left)]
+        level, *rest = torch.stack(of_state)[:, :, None].expand(-1, *arcs.shape[:2])
+        return torch.stack([outlook[:, 2].expand_as(level), level, arcs[..., -1], arcs.amin(dim=-1), *rest], dim=-1)
 
 
 def save_network(network: ViewAttention, path: Path, object_name: str, provenance: dict | None = None) -> None:
