@@ -51,6 +51,7 @@ def test_without_a_command_the_help_is_shown():
     [
         (["nonsense"], "No such command 'nonsense'"),
         (["object"], "Missing command"),
+        (["train"], "Missing command"),
         (["episode", "--steps", "-1"], "--steps"),
         (["episode", "--steps", "many"], "--steps"),
         (["episode", "--sede", "3"], "--sede"),

@@ -24,7 +24,6 @@ from active6d_bringup.cli import (
     scenes,
     train,
 )
-from active6d_bringup.cli.output import show_help
 
 
 class CommandGroup(TyperGroup):
@@ -57,7 +56,6 @@ class CommandGroup(TyperGroup):
 
 app = typer.Typer(
     cls=CommandGroup,
-    callback=show_help,
     invoke_without_command=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
@@ -66,6 +64,13 @@ app = typer.Typer(
     "Example: [bold]active6d episode --object mug --seed 7 --policy lowest-score --bag bags/mug[/bold]",
     epilog="ACTIVE6D_TRACEBACK=1 shows the full traceback of an error.",
 )
+
+
+@app.callback()
+def show_help(ctx: typer.Context) -> None:
+    """Without a command, help is what one wants."""
+    if ctx.invoked_subcommand is None:
+        typer.echo(ctx.get_help())
 
 
 app.command()(doctor.doctor)

@@ -4,9 +4,14 @@ from typing import Annotated
 
 import typer
 
-from active6d_bringup.cli.output import JsonFile, ObjectName, Seed, command_group, console, progress_bar, write_json
+from active6d_bringup.cli.output import JsonFile, ObjectName, Seed, console, progress_bar, write_json
 
-app = command_group("Measure speed and quality.")
+app = typer.Typer(help="Measure speed and quality.", rich_markup_mode="rich")
+
+
+@app.callback()
+def benchmark() -> None:
+    """Measure speed and quality."""
 
 
 @app.command()

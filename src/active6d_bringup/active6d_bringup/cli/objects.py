@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_bringup.cli.output import JsonFile, command_group, console, messages, write_file, write_json
+from active6d_bringup.cli.output import JsonFile, console, messages, write_file, write_json
 
 if TYPE_CHECKING:
     from active6d_core.object_model import ObjectModel
 
-app = command_group("Object models: list, show, add.")
+app = typer.Typer(help="Object models: list, show, add.", rich_markup_mode="rich")
 
 
 @app.command("list")

@@ -30,17 +30,6 @@ Overrides = Annotated[
 _VERSIONS = ("numpy", "scipy", "open3d", "pybullet", "torch", "rclpy")
 
 
-def show_help(ctx: typer.Context) -> None:
-    """Without a command, help is what one wants."""
-    if ctx.invoked_subcommand is None:
-        typer.echo(ctx.get_help())
-
-
-def command_group(text: str) -> typer.Typer:
-    """Commands on one subject, which ``text`` names."""
-    return typer.Typer(help=text, rich_markup_mode="rich", invoke_without_command=True, callback=show_help)
-
-
 def progress_bar() -> Progress:
     """A progress bar on standard error with a description, counts, elapsed time and time left."""
     return Progress(

@@ -9,7 +9,6 @@ from active6d_bringup.cli.output import (
     JsonFile,
     ObjectName,
     Seed,
-    command_group,
     console,
     messages,
     progress_bar,
@@ -17,7 +16,7 @@ from active6d_bringup.cli.output import (
     write_json,
 )
 
-app = command_group("Stored scenes: generate, report, show.")
+app = typer.Typer(help="Stored scenes: generate, report, show.", rich_markup_mode="rich")
 
 
 @app.command()

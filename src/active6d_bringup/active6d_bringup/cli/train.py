@@ -10,17 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-from active6d_bringup.cli.output import (
-    JsonFile,
-    ObjectName,
-    Seed,
-    command_group,
-    export_weights,
-    progress_bar,
-    write_json,
-)
+from active6d_bringup.cli.output import JsonFile, ObjectName, Seed, export_weights, progress_bar, write_json
 
-app = command_group("Train what is learned.")
+app = typer.Typer(help="Train what is learned.", rich_markup_mode="rich")
 
 _DATA = "Folder for training views and the training's state; by default active6d/training/OBJECT in the cache folder."
 
