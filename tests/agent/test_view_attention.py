@@ -19,6 +19,7 @@ from active6d_agent.policy import create_policy
 from active6d_agent.view_attention import (
     ViewAttentionPolicy,
     Weighing,
+    best_verified,
     encode,
     new_network,
     save_network,
@@ -133,6 +134,62 @@ def test_the_line_of_sight_is_the_heuristics(network, observation, lookup):
     for index in range(len(centres)):
         expected = line_of_sight(centres, index, lookup.sphere.positions, lookup.model.diameter)
         np.testing.assert_allclose(pairs[0, :, index, 0], expected, atol=1e-4)
+
+
+def test_pairs_are_what_geometry_says(network, observation, lookup):
+    """Columns 2 to 11, one pair at a time, by their definitions."""
+    _, pairs, _ = network.describe(encode([observation]))
+    grid, taken = lookup.sphere.positions, observation.positions
+    best = observation.objects.take(best_verified(observation)).T_world_object
+    sight = np.stack([line_of_sight(best[:, :3, 3], index, taken, lookup.model.diameter) for index in range(len(best))])
+    for view, index in [(0, 0), (25, 3), (60, 1), (99, len(best) - 1)]:
+        R, centre = best[index, :3, :3], best[index, :3, 3]
+        ray = (grid[view] - centre) / np.linalg.norm(grid[view] - centre)
+        earlier = taken - centre
+        cosines = earlier / np.linalg.norm(earlier, axis=1, keepdims=True) @ ray
+        expected = [
+            ray[2],
+            np.arccos(cosines.max()) / np.pi,
+            cosines.max(),
+            (sight[index] * (1 + cosines) / 2).max(),
+            np.linalg.norm(grid[view] - centre) / lookup.sphere.radius - 1,
+            ray[:2] @ centre[:2] / np.linalg.norm(centre[:2]),
+            ray @ grid[view] / lookup.sphere.radius - 0.95,
+            *(R.T @ ray),
+        ]
+        np.testing.assert_allclose(pairs[0, view, index, 2:], expected, atol=2e-4)
+
+
+def test_the_network_is_what_its_layers_say(network, lookup, observation):
+    """One view and one object at a time, beside a padded row: attention pools, gains of objects add up."""
+    fewer = replace(observation, objects=observation.objects.take(np.arange(3)), steps_left=2)
+    state = encode([observation, fewer])
+    with torch.inference_mode():
+        now, later, attention = network(state)
+        objects, pairs, views = network.describe(state)
+        for row, view in [(0, 0), (0, 77), (1, 30)]:
+            n = int(state["present"][row].sum())
+            h = network.of_object(objects[row, :n])
+            pooled = h.mean(dim=0)
+            h = network.in_context(torch.cat([h, pooled.expand_as(h)], dim=1))
+            of_view = network.pair_from_view(views[row, view])
+            e = torch.relu(network.of_pair(pairs[row, view, :n]) + network.pair_from_object(h) + of_view)
+            e = e + network.mix(e)
+            weights = torch.softmax(network.attend(e)[:, 0], dim=0)
+            whole = torch.cat([weights @ e, e.mean(dim=0), pooled, views[row, view]])
+            gains = sum(network.per_object(each) for each in e) + network.per_view(whole)
+            np.testing.assert_allclose(torch.cat([now[row, view], later[row, view]]), gains, atol=1e-4)
+            np.testing.assert_allclose(attention[row, view, :n], weights, atol=1e-5)
+
+
+def test_a_decision_leaves_the_threads_as_they_were(policy, observation):
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        policy().decide(observation)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
 
 
 def test_candidates_are_kept_to(policy, observation):

@@ -10,7 +10,8 @@ The network predicts what a view gains at once and what can still be gained afte
 :mod:`active6d_agent.imitation`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -314,6 +315,18 @@ def value_views(network: ViewAttention, observations: Sequence[Observation], wei
     return ViewValues(worth, np.where(candidates, (now + later) @ weigh, -np.inf), attention)
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One observation is too little work to share: on a busy machine its threads wait for each other a hundred times
+    as long as they work. What else the process computes keeps its threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 @register_policy("view-attention")
 class ViewAttentionPolicy:
     """Goes to the view that is worth most: what it gains at once, plus what the moves after it are expected to gain,
@@ -352,7 +365,8 @@ class ViewAttentionPolicy:
 
     def decide(self, observation: Observation) -> Decision:
         """The view of most worth, and the object that it attends to."""
-        values = value_views(self.network, [observation], self._weighing)
+        with _one_thread():
+            values = value_views(self.network, [observation], self._weighing)
         most = values.gain[0].max()
         if most == -np.inf or (self._stop_below > 0 and most < self._stop_below):
             return Decision.stop_here(observation)
