@@ -4,7 +4,6 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Annotated
@@ -32,15 +31,17 @@ def run(job: Job, object_name: str, threads: int) -> None:
         raise RuntimeError("\n".join(done.stderr.strip().splitlines()[-3:]))
 
 
-def run_all(jobs: Iterable[tuple[Job, str]], workers: int) -> list[str]:
+def run_all(jobs: list[tuple[Job, str]], workers: int) -> list[str]:
     """Run commands side by side; what went wrong, a line each."""
-    jobs, failures = list(jobs), []
+    failures: list[str] = []
+    if not jobs:
+        return failures
     threads = max(1, (os.cpu_count() or 1) // workers)
     with ThreadPoolExecutor(workers) as pool, progress_bar() as bar:
         running = {pool.submit(run, job, name, threads): f"{job.name}, {name}" for job, name in jobs}
-        task = bar.add_task("measuring", total=len(jobs))
+        task = bar.add_task(f"measuring {', '.join(dict.fromkeys(job.name for job, _ in jobs))}", total=len(jobs))
         for done in as_completed(running):
-            bar.update(task, advance=1, description=f"done: {running[done]}")
+            bar.update(task, advance=1)
             if error := done.exception():
                 failures.append(f"{running[done]}: {error}")
                 bar.console.print(failures[-1], highlight=False, markup=False)
@@ -72,8 +73,11 @@ def main(
         for object_name in objects.split(",")
         if (trainings or not JOBS[name].trains) and (again or not JOBS[name].is_done(ROOT, object_name.strip()))
     ]
-    failures = run_all((pair for pair in wanted if not pair[0].times), workers)
-    failures += run_all((pair for pair in wanted if pair[0].times), 1)
+    failures = run_all([pair for pair in wanted if not (pair[0].trains or pair[0].times)], workers)
+    # One training after the other, objects side by side: ablations share trainings.
+    for job in (job for job in JOBS.values() if job.trains):
+        failures += run_all([pair for pair in wanted if pair[0] is job], workers)
+    failures += run_all([pair for pair in wanted if pair[0].times], 1)
     write_file(PAGE, fill(PAGE.read_text(), read_reports(ROOT)))
     messages.print(f"{len(wanted) - len(failures)} measured, {len(failures)} failed; wrote {PAGE}", highlight=False)
     raise typer.Exit(bool(failures))

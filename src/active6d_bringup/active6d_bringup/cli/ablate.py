@@ -270,13 +270,14 @@ def _trade_offs(rows: list[dict]) -> list["Panel"]:
     from active6d_bringup.report.lines import Panel
 
     panels = []
-    for x, x_label, y, y_label in (
-        ("distance_m", "d [m]", "detection_rate", "detection rate"),
-        ("distance_m", "d [m]", "e_add_mm", "e_ADD [mm]"),
-        ("moves", "moves taken", "detection_rate", "detection rate"),
+    everything = ("metres_weight", "stop_below", "as shipped", "random")
+    for x, x_label, y, y_label, names in (
+        ("distance_m", "d [m]", "detection_rate", "detection rate", everything),
+        ("distance_m", "d [m]", "e_add_mm", "e_ADD [mm]", everything),
+        ("moves", "moves taken", "detection_rate", "detection rate", everything[1:]),
     ):
         lines = {}
-        for name in ("metres_weight", "stop_below", "as shipped", "random"):
+        for name in names:
             own = [row for row in rows if row["parameter"] == name]
             lines[name] = ([row[x] for row in own], [row[y] for row in own])
         panels.append(Panel(x_label, y_label, lines))

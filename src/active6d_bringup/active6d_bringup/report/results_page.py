@@ -56,7 +56,7 @@ JOBS = {
     for job in (
         Job("evaluate", "evaluate --policies all --steps 5"),
         Job("evaluate_ten", "evaluate --policies random --steps 10"),
-        Job("steps", f"ablate steps --policies random,max-distance,lowest-score,{DEFAULT} --sample 200", draws=True),
+        Job("steps", f"ablate steps --policies random,max-distance,lowest-score,{DEFAULT} --sample 100", draws=True),
         Job("planning", "ablate planning --sample 200", draws=True),
         Job("fusion", "ablate fusion --policies random --sample 1000"),
         Job("verification", "ablate verification --policies random --sample 1000"),
