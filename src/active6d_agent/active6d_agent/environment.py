@@ -39,8 +39,8 @@ class RewardParameters:
     alpha: float = 0.3
     beta: float = 0.5
     error_scale: float = 1.0
-    distance_scale: float = 1.0
-    motion_scale: float = 0.1
+    distance_scale: float = 0.1
+    motion_scale: float = 0.02
     as_printed: bool = False
 
     def __post_init__(self) -> None:
