@@ -247,10 +247,45 @@ def test_labels_are_what_views_gain(lookup):
     for view in (0, 31, 99):
         views = np.array([[8, 30, view]])
         added = tally(lookup, np.array([1]), views) - tally(lookup, np.array([1]), views[:, :2])
-        np.testing.assert_allclose(gains[view], added[0])
+        np.testing.assert_allclose(gains[view].sum(axis=0), added[0], atol=1e-6)
     worths = [worth(lookup, np.array([1]), np.array([[8, view]]))[0] if view != 8 else -1 for view in range(100)]
-    first = imitation.candidate_gains(lookup, 1, np.array([8])) @ [1.0, 0.999 / 8]
+    first = imitation.candidate_gains(lookup, 1, np.array([8])).sum(axis=1) @ [1.0, 0.999 / 8]
     assert int(np.argmax(worths)) == int(np.nanargmax(np.round(first, 9))) == search_views(lookup, 1, 8, 1)[1]
+
+
+def test_labels_tell_which_object_gains(lookup):
+    """Each true object's gain is its stand-in's, in the network's order; the others' comes last."""
+    taken, view, limit = [8, 30], 31, 0.1 * lookup.model.diameter
+    (before,), (after,) = (
+        lookup.object_errors(lookup.fuse(np.array([1]), np.array([views]), np.array([views[-1]])))
+        for views in (taken, [*taken, view])
+    )
+    gains = imitation.candidate_gains(lookup, 1, np.array(taken))[view]
+    observation = observe(lookup, np.array([1]), np.array([taken]), np.array([2]))[0]
+    order, stand_ins = best_verified(observation).tolist(), {}
+    for index, position in enumerate(observation.objects.T_world_object[:, :3, 3]):
+        row = np.linalg.norm(lookup.positions - position, axis=1).argmin()
+        stand_ins.setdefault(lookup.nearest_object[row], order.index(index))
+    count = lookup.object_count[1]
+    detected = (after < limit).astype(int) - (before < limit)
+    for index in range(count):
+        if index in stand_ins:
+            assert gains[stand_ins[index], 0] == detected[index]
+            assert gains[stand_ins[index], 1] == pytest.approx((before[index] - after[index]) / 0.05, abs=1e-6)
+    others = [index for index in range(count) if index not in stand_ins]
+    assert gains[-1, 0] == pytest.approx(detected[others].sum(), abs=1e-9)
+    assert len(gains) == len(order) + 1
+
+
+def test_explained_gains_are_those_of_the_views(network, observation):
+    fewer = replace(observation, objects=observation.objects.take(np.arange(3)), steps_left=1)
+    state = encode([observation, fewer])
+    with torch.inference_mode():
+        now, later, _ = network(state)
+        explained, after = network.explain(state)
+    np.testing.assert_allclose(explained.sum(dim=2), now, atol=1e-4)
+    np.testing.assert_allclose(after, later, atol=1e-4)
+    np.testing.assert_array_equal(explained[1, :, 3:-1], 0.0)
 
 
 def test_later_gains_are_the_learners_own_moves(lookup):

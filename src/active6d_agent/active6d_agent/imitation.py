@@ -15,13 +15,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.optim.swa_utils import AveragedModel
 
 from active6d_agent.evaluation import all_starts, measure, observe
 from active6d_agent.lookup import BankLookup
-from active6d_agent.oracle import tally
+from active6d_agent.oracle import known, tally
 from active6d_agent.policy import Observation
 from active6d_agent.view_attention import (
     GAINS,
+    MAX_OBJECTS,
     ViewAttention,
     Weighing,
     encode,
@@ -33,6 +35,8 @@ from active6d_agent.view_attention import (
 
 # Episodes that the network values together: more are no faster and need memory.
 _TOGETHER = 64
+# The weights that play are a mean over about as many steps as four rounds have.
+_MEAN_DECAY = 0.995
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class ImitationParameters:
         capacity: states kept, the latest.
         starts: validation episodes.
         evaluate_every: rounds between validations.
+        object_weight: of the loss about single objects, against that about a view's sum.
         hidden: width of the network.
         seed: of everything.
 
@@ -75,6 +80,7 @@ class ImitationParameters:
     capacity: int = 12_000
     starts: int = 150
     evaluate_every: int = 5
+    object_weight: float = 1.0
     hidden: int = 32
     seed: int = 0
 
@@ -82,7 +88,7 @@ class ImitationParameters:
         for name in ("explore", "improve_after"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"training: {name} must be in [0, 1], got {getattr(self, name)}")
-        for name in asdict(self).keys() - {"explore", "improve_after", "learning_rate", "seed"}:
+        for name in asdict(self).keys() - {"explore", "improve_after", "learning_rate", "object_weight", "seed"}:
             if getattr(self, name) < 1:
                 raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
         if not self.learning_rate > 0:
@@ -118,7 +124,7 @@ class Example:
 
     Attributes:
         observation: the state.
-        now: (M, 2) gains of each view, NaN for those that are no candidates.
+        now: (M, n + 1, 2) :func:`candidate_gains`.
         later: (M, 2) gains of the learner's moves after it, NaN where they were not played.
     """
 
@@ -226,13 +232,27 @@ def roll_out(
 
 
 def candidate_gains(lookup: BankLookup, scene: int, views: np.ndarray) -> np.ndarray:
-    """(M, 2) what each view adds to the (v,) views taken (:func:`~active6d_agent.oracle.tally`), NaN for those."""
+    """What each view adds to the (v,) views taken, NaN for those.
+
+    Returns:
+        (M, n + 1, 2) gains (:func:`~active6d_agent.oracle.known`) of the true objects that the n accumulated ones are
+        best for, in the order of :func:`~active6d_agent.view_attention.best_verified`; of several for one true object
+        the best has the gain. Last, what all true objects gain that none stands for.
+    """
     free = np.setdiff1d(np.arange(len(lookup.sphere)), views)
     paths = np.column_stack([np.tile(views, (len(free) + 1, 1)), np.append(free, views[-1])])
-    known = tally(lookup, np.full(len(paths), scene), paths)
-    gains = np.full((len(lookup.sphere), GAINS), np.nan)
-    gains[free] = known[:-1] - known[-1]
-    return gains
+    after = known(lookup, np.full(len(paths), scene), paths)
+    added = after[:-1] - after[-1]
+    rows = lookup.fuse(np.array([scene]), views[None], views[-1:]).objects[0]
+    stands_for, best = np.unique(lookup.nearest_object[rows], return_index=True)
+    gains = np.full((len(lookup.sphere), len(rows) + 1, GAINS), np.nan)
+    gains[free] = 0.0
+    gains[free[:, None], best] = added[:, stands_for]
+    gains[free, -1] = added.sum(axis=1) - added[:, stands_for].sum(axis=1)
+    order = np.argsort(-lookup.verification[rows], kind="stable")
+    kept, left_out = order[:MAX_OBJECTS], order[MAX_OBJECTS:]
+    gains[free, -1] += gains[free[:, None], left_out].sum(axis=1)
+    return gains[:, np.append(kept, len(rows))]
 
 
 class _Learner:
@@ -241,9 +261,12 @@ class _Learner:
     def __init__(self, lookup: BankLookup, parameters: ImitationParameters, weighing: Weighing) -> None:
         torch.manual_seed(parameters.seed)
         self.lookup, self.parameters, self._weighing = lookup, parameters, weighing
-        self.network = new_network(lookup.model, parameters.hidden)
+        self._trained = new_network(lookup.model, parameters.hidden)
+        self.optimizer = torch.optim.Adam(self._trained.parameters(), parameters.learning_rate, weight_decay=1e-5)
+        # What plays and is kept is a running mean of the weights: it does better on other scenes than the latest.
+        self._average = AveragedModel(self._trained, avg_fn=_running_mean).eval()
+        self.network: ViewAttention = self._average.module
         self.network.weighing = replace(weighing, lookahead=0.0)
-        self.optimizer = torch.optim.Adam(self.network.parameters(), parameters.learning_rate, weight_decay=1e-5)
         self.rng = np.random.default_rng(parameters.seed)
         self.memory: deque[Example] = deque(maxlen=parameters.capacity)
         self.round, self.states = 0, 0
@@ -256,7 +279,8 @@ class _Learner:
     def restore(self, path: Path) -> tuple[tuple[float, float], float]:
         """Take the weights of an earlier training; the best so far and the seconds spent."""
         known = load_network(path, self.lookup.model.name)
-        self.network.load_state_dict(known.state_dict())
+        for network in (self._trained, self.network):
+            network.load_state_dict(known.state_dict())
         self.network.weighing = known.weighing
         provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
         progress = provenance["progress"]
@@ -273,9 +297,7 @@ class _Learner:
         share = self.round / self.parameters.rounds
         for group in self.optimizer.param_groups:
             group["lr"] = self.parameters.learning_rate * (0.02 + 0.98 * (1 + np.cos(np.pi * share)) / 2)
-        self.network.train()
         loss = float(np.mean([self._update() for _ in range(self.parameters.updates)]))
-        self.network.eval()
         self.round += 1
         return loss
 
@@ -297,7 +319,7 @@ class _Learner:
             self.memory.extend(map(Example, observations, nows, laters))
             self.states += len(observations)
             weigh = [1.0, self._weighing.error_weight]
-            best = [self._best(now @ weigh, worth, lead) for now, worth in zip(nows, values, strict=True)]
+            best = [self._best(now.sum(axis=1) @ weigh, worth, lead) for now, worth in zip(nows, values, strict=True)]
             views[running, (views[running] >= 0).sum(axis=1)] = best
             left[running] -= 1
             return np.array(best)
@@ -314,7 +336,7 @@ class _Learner:
         self, observations: list[Observation], scene: np.ndarray, views: np.ndarray, nows: list, values: np.ndarray
     ) -> list[np.ndarray]:
         """(M, 2) later gains per state: of the most valued views, and of as many drawn ones."""
-        laters = [np.full_like(now, np.nan) for now in nows]
+        laters = [np.full((len(now), GAINS), np.nan) for now in nows]
         wanted = [
             (state, view)
             for state, (observation, worth) in enumerate(zip(observations, values, strict=True))
@@ -349,14 +371,38 @@ class _Learner:
             played = [np.flatnonzero(np.isfinite(example.later[:, 0])) for example in drawn]
             some = np.unique(np.concatenate([some, *(self.rng.permutation(each)[:1] for each in played)]).astype(int))
         state["views"] = state["views"][some]
-        now, later, _ = self.network(state)
-        loss = _loss(now, np.stack([example.now[some] for example in drawn]))
+        now, later = self._trained.explain(state)
+        truth = _labels(drawn, some, now.shape[2])
+        loss = _loss(now.sum(dim=2), truth.sum(axis=2)) + self.parameters.object_weight * _loss_of_objects(now, truth)
         loss = loss + _loss(later, np.stack([example.later[some] for example in drawn]))
         self.optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(self._trained.parameters(), 1.0)
         self.optimizer.step()
+        self._average.update_parameters(self._trained)
         return float(loss.detach())
+
+
+def _running_mean(mean: torch.Tensor, value: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+    """Exponential, but at first over all there is, or it would remember where the training began."""
+    return torch.lerp(value, mean, torch.clamp((1 + count) / (10 + count), max=_MEAN_DECAY))
+
+
+def _labels(drawn: list[Example], views: np.ndarray, count: int) -> np.ndarray:
+    """(B, M', count, 2) gains now at (M',) views, padded before what no object stands for."""
+    padded = np.zeros((len(drawn), len(views), count, GAINS))
+    for row, example in zip(padded, drawn, strict=True):
+        own = example.now[views]
+        row[:, : own.shape[1] - 1], row[:, -1] = own[:, :-1], own[:, -1]
+    return padded
+
+
+def _loss_of_objects(predicted: torch.Tensor, truth: np.ndarray) -> torch.Tensor:
+    """Square error of (B, M, n, 2) gains, summed over objects, where they are known."""
+    target = torch.from_numpy(truth.astype(np.float32))
+    known = torch.isfinite(target[:, :, -1])
+    off = ((predicted - torch.nan_to_num(target)) ** 2).sum(dim=2)
+    return torch.where(known, off, 0.0).sum() / known.sum().clamp(min=1)
 
 
 def _loss(predicted: torch.Tensor, truth: np.ndarray) -> torch.Tensor:

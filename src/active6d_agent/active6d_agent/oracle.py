@@ -9,17 +9,22 @@ from active6d_core.metrics import DETECTION_FRACTION, MISSED_E_ADD
 _CHUNK = 4096
 
 
-def tally(lookup: BankLookup, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """(E, 2) what is known after (E, v) views, -1 padding: the number of objects detected, and the sum over all
-    objects of 1 - e_ADD / 50 mm."""
-    tallies = []
+def known(lookup: BankLookup, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """(E, o, 2) what is known of every true object after (E, v) views, -1 padding: 1 when it is detected, and
+    1 - e_ADD / 50 mm; zeros beyond a scene's own objects."""
+    parts = []
     for start in range(0, len(scene), _CHUNK):
         part = slice(start, start + _CHUNK)
         errors = lookup.object_errors(lookup.fuse(scene[part], views[part], views[part, -1]))
         real = np.arange(errors.shape[1]) < lookup.object_count[scene[part]][:, None]
-        detected = (real & (errors < DETECTION_FRACTION * lookup.model.diameter)).sum(axis=1)
-        tallies.append(np.column_stack([detected, (real * (1.0 - errors / MISSED_E_ADD)).sum(axis=1)]))
-    return np.concatenate(tallies)
+        detected = errors < DETECTION_FRACTION * lookup.model.diameter
+        parts.append(np.stack([real & detected, real * (1.0 - errors / MISSED_E_ADD)], axis=-1))
+    return np.concatenate(parts)
+
+
+def tally(lookup: BankLookup, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """(E, 2) the sums of :func:`known` over the objects."""
+    return known(lookup, scene, views).sum(axis=1)
 
 
 def worth(lookup: BankLookup, scene: np.ndarray, views: np.ndarray) -> np.ndarray:

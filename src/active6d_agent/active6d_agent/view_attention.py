@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -98,6 +99,21 @@ def encode(observations: Sequence[Observation]) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 
+class _Seen(NamedTuple):
+    """What (M) views make of (n) objects."""
+
+    pairs: torch.Tensor
+    """(B, M, n, hidden), also of objects that are padding"""
+    total: torch.Tensor
+    """(B, M, hidden) sum over the objects"""
+    whole: torch.Tensor
+    """(B, M, 3 hidden + 8) the attended, the mean, and what is known of the view"""
+    attention: torch.Tensor
+    """(B, M, n)"""
+    mask: torch.Tensor
+    """(B, n) 1 for an object, 0 for padding"""
+
+
 class ViewAttention(nn.Module):
     """Values of all views.
 
@@ -135,12 +151,30 @@ class ViewAttention(nn.Module):
             (B, M, 2) gains of going there next; (B, M, 2) gains of the moves after that, zero where none are left;
             (B, M, n) each view's attention to the objects.
         """
-        present = state["present"]
+        seen = self._look(state)
+        # Gains of different objects add up, each a linear function of its features, so they are had from the sum of
+        # those. What nobody has seen yet is for the view as a whole to say.
+        bias = (seen.mask.sum(dim=1, keepdim=True) * self.per_object.bias)[:, None]
+        gains = seen.total @ self.per_object.weight.T + bias + self.per_view(seen.whole)
+        more = (state["left"] > 1)[:, None, None]
+        return gains[..., :GAINS], gains[..., GAINS:] * more, seen.attention
+
+    def explain(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """What :meth:`forward` adds up, to learn from: (B, M, n + 1, 2) gains of going there next, of each object and
+        at the end of the view as a whole; (B, M, 2) gains after that. Only the former shape what the layers before
+        see: the latter are sums over many moves, and say next to nothing about a single object."""
+        seen = self._look(state)
+        mask, more = seen.mask[:, None, :, None], (state["left"] > 1)[:, None, None]
+        rest = self.per_view(seen.whole)[:, :, None]
+        now = torch.cat([self.per_object(seen.pairs) * mask, rest], dim=2)[..., :GAINS]
+        own = (self.per_object(seen.pairs.detach()) * mask).sum(dim=2)
+        return now, (own + self.per_view(seen.whole.detach()))[..., GAINS:] * more
+
+    def _look(self, state: dict[str, torch.Tensor]) -> "_Seen":
         objects, pairs, views = self.describe(state)
         h = self.of_object(objects)
-        mask = present.to(h.dtype)
-        number = mask.sum(dim=1, keepdim=True)
-        count = number.clamp(min=1)
+        mask = state["present"].to(h.dtype)
+        count = mask.sum(dim=1, keepdim=True).clamp(min=1)
         pooled = (h * mask[..., None]).sum(dim=1) / count
         h = self.in_context(torch.cat([h, pooled[:, None].expand_as(h)], dim=-1))
         # Passes over (B, M, n, hidden) are what costs: sums are in place, and masks in the weights of sums.
@@ -149,15 +183,11 @@ class ViewAttention(nn.Module):
         e += self.pair_from_view(views)[:, :, None]
         e = e.relu_()
         e = e + self.mix(e)
-        logits = self.attend(e)[..., 0].masked_fill_(~present[:, None], -1e9)
+        logits = self.attend(e)[..., 0].masked_fill_(mask[:, None] == 0, -1e9)
         attention = torch.softmax(logits, dim=-1) * mask[:, None]
         attended, total = (torch.stack([attention, mask[:, None].expand_as(attention)], dim=2) @ e).unbind(dim=2)
         whole = torch.cat([attended, total / count[..., None], pooled[:, None].expand_as(total), views], dim=-1)
-        # Gains of different objects add up, each a linear function of its features, so they are had from the sum of
-        # those. What nobody has seen yet is for the view as a whole to say.
-        gains = total @ self.per_object.weight.T + (number * self.per_object.bias)[:, None] + self.per_view(whole)
-        more = (state["left"] > 1)[:, None, None]
-        return gains[..., :GAINS], gains[..., GAINS:] * more, attention
+        return _Seen(e, total, whole, attention, mask)
 
     def describe(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What is known of (B, n, 14) objects, (B, M, n, 12) pairs and (B, M, 8) views; none of it names a direction
