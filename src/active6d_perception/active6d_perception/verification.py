@@ -86,17 +86,19 @@ class Verifier:
         Returns:
             (n,) values of equation 1.
         """
-        R, t = T_camera_object[owner, :3, :3], T_camera_object[owner, :3, 3]
+        # Whole rows are taken: several times faster than indexing into them.
+        T = T_camera_object.take(owner, axis=0)
+        R, t = T[:, :3, :3], T[:, :3, 3]
         q = np.einsum("ni,nij->nj", points - t, R)
         direction = self.views.nearest_direction(T_camera_object)[owner]
         distance, p = self.views.nearest_visible(q, direction, self.epsilon + self.views.spacing)
         reached = np.flatnonzero(p >= 0)
-        q, p, distance = q[reached], p[reached], distance[reached]
-        n_p = self.views.normals[p]
-        off_plane = np.einsum("ni,ni->n", q - self.views.points[p], n_p)
+        q, p, distance = q.take(reached, axis=0), p[reached], distance[reached]
+        n_p = self.views.normals.take(p, axis=0)
+        off_plane = np.einsum("ni,ni->n", q - self.views.points.take(p, axis=0), n_p)
         along = np.sqrt(np.maximum(distance**2 - off_plane**2, 0.0))
         to_surface = np.hypot(off_plane, np.maximum(along - self.views.spacing, 0.0))
-        product = np.einsum("ni,ni->n", np.einsum("ni,nij->nj", normals, R)[reached], n_p)
+        product = np.einsum("ni,ni->n", np.einsum("ni,nij->nj", normals, R).take(reached, axis=0), n_p)
         fits = np.zeros(len(points))
         fits[reached] = local_fit(to_surface, product, self.epsilon)
         return fits
@@ -119,7 +121,7 @@ class Verifier:
         place = np.arange(len(owner)) - (np.cumsum(counts) - counts)[owner]
         stretched = place * (sizes[owner] - 1) // max(self.samples - 1, 1)
         chosen = np.where(sizes[owner] > self.samples, stretched, place) + (np.cumsum(sizes) - sizes)[owner]
-        x0, y0, x1, _ = corners[owner].T
+        x0, y0, x1, _ = corners.take(owner, axis=0).T
         rows, columns = np.divmod(np.concatenate([*inside, np.zeros(0, int)])[chosen], x1 - x0)
         return (rows + y0) * width + columns + x0, owner
 
@@ -143,26 +145,22 @@ def points_and_normals(
     """
     height, width = depth.shape
     v, u = np.divmod(pixels, width)
-    points = _backproject(depth, camera, u, v)
-    tangents = []
-    for du, dv in ((reach, 0), (0, reach)):
-        after = _backproject(depth, camera, np.minimum(u + du, width - 1), np.minimum(v + dv, height - 1)) - points
-        before = points - _backproject(depth, camera, np.maximum(u - du, 0), np.maximum(v - dv, 0))
-        jump_after, jump_before = np.abs(after[2]), np.abs(before[2])
-        one_side = np.where((jump_after <= jump_before) | np.isnan(jump_before), after, before)
-        # A smooth surface changes its slope little within a few pixels; 5 mm between the two sides is an edge.
-        smooth = np.abs(jump_after - jump_before) < 0.005
-        tangents.append(np.where(smooth, after + before, one_side))
-    (ax, ay, az), (bx, by, bz) = tangents
+    # The pixel, then the one after and the one before it along the row, then along the column.
+    u = np.clip(u + reach * np.array([[0], [1], [-1], [0], [0]]), 0, width - 1)
+    v = np.clip(v + reach * np.array([[0], [0], [0], [1], [-1]]), 0, height - 1)
+    z = depth.take(v * width + u).astype(float)
+    # Coordinates first, so that each is one contiguous row.
+    around = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
+    points = around[:, 0]
+    after, before = around[:, 1::2] - points[:, None], points[:, None] - around[:, 2::2]
+    jump_after, jump_before = np.abs(after[2]), np.abs(before[2])
+    one_side = np.where((jump_after <= jump_before) | np.isnan(jump_before), after, before)
+    # A smooth surface changes its slope little within a few pixels; 5 mm between the two sides is an edge.
+    smooth = np.abs(jump_after - jump_before) < 0.005
+    (ax, bx), (ay, by), (az, bz) = np.where(smooth, after + before, one_side)
     normals = np.nan_to_num(np.stack([by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax]))
     length = np.sqrt((normals**2).sum(axis=0))
     # Facing the camera is against the ray to the point.
     length[(normals * points).sum(axis=0) > 0] *= -1
     np.divide(normals, length, out=normals, where=length != 0)
     return points.T, normals.T
-
-
-def _backproject(depth: np.ndarray, camera: PinholeCamera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(3, n) points at pixels: coordinates first, so that each is one contiguous row."""
-    z = depth[v, u].astype(float)
-    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
