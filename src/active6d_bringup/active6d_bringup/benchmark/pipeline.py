@@ -63,7 +63,7 @@ def measure_pipeline(
         object_name: what is in the bin.
         policy: who decides. Without trained weights of ``view-attention`` untrained ones are timed, which cost as much.
         seed: of heap, views and hypotheses.
-        repeats: of every measurement.
+        repeats: of every measurement; ten times as many of the last view, for the 99th percentile.
         counts: numbers of accumulated hypotheses for the curve.
         on_progress: called with what is being done, and how much of it is done.
 
@@ -77,7 +77,8 @@ def measure_pipeline(
     verifier, rng = Verifier(prepared.model), np.random.default_rng(seed)
     found = list(prepared.hypotheses.values())
     on_progress("last view", 0, 1)
-    times = time_last_view(prepared, found, verifier, decider, max(repeats, 100))
+    # A 99th percentile needs hundreds of times, or it is one slow one.
+    times = time_last_view(prepared, found, verifier, decider, max(10 * repeats, 100))
     cost = []
     for done, count in enumerate(counts):
         on_progress(f"{count} hypotheses", done, len(counts))
