@@ -23,6 +23,7 @@ from active6d_agent.view_attention import (
     encode,
     new_network,
     save_network,
+    trace,
     value_views,
 )
 from active6d_core.se3 import make_transform
@@ -180,6 +181,17 @@ def test_the_network_is_what_its_layers_say(network, lookup, observation):
             gains = sum(network.per_object(each) for each in e) + network.per_view(whole)
             np.testing.assert_allclose(torch.cat([now[row, view], later[row, view]]), gains, atol=1e-4)
             np.testing.assert_allclose(attention[row, view, :n], weights, atol=1e-5)
+
+
+def test_the_deployed_network_is_the_trained_one(network, lookup):
+    """Whatever the number of objects and views, to the last bit."""
+    deployed = trace(network)
+    for views in ([3], [47, 80], [1, 20, 40, 60, 80, 99]):
+        seen = observe(lookup, np.array([1]), np.array([views]), np.array([2]))[0]
+        for n in (0, 1, 2, len(seen.objects)):
+            each = replace(seen, objects=seen.objects.take(np.arange(n)))
+            for before, after in zip(values(network, [each]), values(deployed, [each]), strict=True):
+                np.testing.assert_array_equal(after, before)
 
 
 def test_a_decision_leaves_the_threads_as_they_were(policy, observation):

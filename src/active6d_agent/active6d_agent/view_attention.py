@@ -22,7 +22,9 @@ from torch import nn
 
 from active6d_agent.policy import Decision, Observation, register_policy, shipped_weights
 from active6d_agent.weights_file import load_weights, save_weights
+from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel
+from active6d_core.view_sphere import ViewSphere
 
 #: Objects beyond these are left out, the best verified being kept.
 MAX_OBJECTS = 64
@@ -194,7 +196,7 @@ class ViewAttention(nn.Module):
         of the world but the vertical."""
         pose, present, taken, grid = state["pose"], state["present"], state["taken"], state["views"]
         rotation, centre = pose[..., :3], pose[..., 3]
-        B, M = len(pose), len(grid)
+        B, M = pose.shape[0], grid.shape[0]
         radius = torch.linalg.vector_norm(taken, dim=-1, keepdim=True)
         outlook, headings = grid / torch.linalg.vector_norm(grid, dim=-1, keepdim=True), taken / radius
         # Cameras last, (B, n, 3, K), so that everything between objects and cameras is one long row after another.
@@ -277,9 +279,9 @@ class ViewAttention(nn.Module):
         self, state: dict[str, torch.Tensor], outlook: torch.Tensor, headings: torch.Tensor
     ) -> torch.Tensor:
         arcs = torch.acos((outlook @ headings.transpose(1, 2)).clamp_(-1, 1).mul_(0.999999)) / np.pi
-        moves, left = (torch.stack([state["moves"], state["left"]]) / 5).clamp_(max=2.0)
+        moves, left = (torch.stack([state["moves"], state["left"]]) / 5).clamp_(max=2.0).unbind()
         of_state = [headings[:, -1, 2], moves, left, state["present"].sum(dim=1) / 20.0, 1.0 / (1.0 + 5 * left)]
-        level, *rest = torch.stack(of_state)[:, :, None].expand(-1, *arcs.shape[:2])
+        level, *rest = torch.stack(of_state)[:, :, None].expand(-1, *arcs.shape[:2]).unbind()
         return torch.stack([outlook[:, 2].expand_as(level), level, arcs[..., -1], arcs.amin(dim=-1), *rest], dim=-1)
 
 
@@ -332,7 +334,7 @@ class ViewValues:
     attention: np.ndarray
 
 
-def value_views(network: ViewAttention, observations: Sequence[Observation], weighing: Weighing) -> ViewValues:
+def value_views(network: nn.Module, observations: Sequence[Observation], weighing: Weighing) -> ViewValues:
     """Value every view of every observation."""
     with torch.inference_mode():
         now, later, attention = (values.double().numpy() for values in network(encode(observations)))
@@ -343,6 +345,20 @@ def value_views(network: ViewAttention, observations: Sequence[Observation], wei
     # Views of equal value differ by rounding, which must not decide.
     worth = np.where(candidates, np.round(worth, 5), -np.inf)
     return ViewValues(worth, np.where(candidates, (now + later) @ weigh, -np.inf), attention)
+
+
+def trace(network: ViewAttention) -> nn.Module:
+    """The same network without Python between its many small operations, for observations of any size."""
+    sphere = ViewSphere()
+    nothing = Observation(SceneObjects.empty(), sphere.positions[:1], sphere, np.ones(len(sphere), bool), 1)
+    state = encode([nothing])
+    # torch calls tracing deprecated, but what shall replace it needs a compiler on the robot.
+    with torch.inference_mode():
+        traced = torch.jit.trace(network, (state,), strict=False, check_trace=False)
+        # The first two calls optimise it; no decision should wait for that.
+        for _ in range(2):
+            traced(state)
+    return traced
 
 
 @contextmanager
@@ -384,10 +400,11 @@ class ViewAttentionPolicy:
         stop_below: float = 0.0,
     ) -> None:
         path = Path(weights) if weights else shipped_weights("view-attention", model.name)
-        self.network = load_network(path, model.name)
+        network = load_network(path, model.name)
         given = {"metres_weight": metres_weight, "error_weight": error_weight, "lookahead": lookahead}
         given = {name: value for name, value in given.items() if value is not None}
-        self._weighing = replace(self.network.weighing, **given)
+        self._weighing = replace(network.weighing, **given)
+        self._network = trace(network)
         self._stop_below = stop_below
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -396,7 +413,7 @@ class ViewAttentionPolicy:
     def decide(self, observation: Observation) -> Decision:
         """The view of most worth, and the object that it attends to."""
         with _one_thread():
-            values = value_views(self.network, [observation], self._weighing)
+            values = value_views(self._network, [observation], self._weighing)
         most = values.gain[0].max()
         if most == -np.inf or (self._stop_below > 0 and most < self._stop_below):
             return Decision.stop_here(observation)
