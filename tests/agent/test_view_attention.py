@@ -230,7 +230,7 @@ def test_many_objects_keep_the_best_verified(policy, observation):
 def test_metres_are_weighed_at_run_time(policy, network, observation):
     """Free, the view of the largest gain; dear, the nearest one."""
     sphere = observation.sphere
-    free, dear = (policy(metres_weight=weight).decide(observation).view for weight in (0.0, 100.0))
+    free, dear = (policy(metres_weight=weight, lookahead=1.0).decide(observation).view for weight in (0.0, 100.0))
     assert free == value_views(network, [observation], Weighing()).gain[0].round(5).argmax()
     arcs = sphere.arc(sphere.positions, observation.positions[-1])
     assert arcs[dear] == pytest.approx(arcs[observation.candidates()].min())
@@ -253,16 +253,35 @@ def test_what_counts_adds_up(network, observation):
 
 
 def test_labels_are_what_views_gain(lookup):
-    """Against the environment's own results, view by view; the oracle takes the best of them."""
-    gains = imitation.candidate_gains(lookup, 1, np.array([8, 30]))
-    assert np.isnan(gains[[8, 30]]).all()
+    """Against whole episodes, view by view; the oracle takes the best of them."""
+    now, later = imitation.candidate_gains(lookup, 1, np.array([8, 30]), left=3)
+    assert np.isnan(now[[8, 30]]).all()
+    assert np.isnan(later[[8, 30]]).all()
+    scene = np.array([1])
     for view in (0, 31, 99):
-        views = np.array([[8, 30, view]])
-        added = tally(lookup, np.array([1]), views) - tally(lookup, np.array([1]), views[:, :2])
-        np.testing.assert_allclose(gains[view].sum(axis=0), added[0], atol=1e-6)
-    worths = [worth(lookup, np.array([1]), np.array([[8, view]]))[0] if view != 8 else -1 for view in range(100)]
-    first = imitation.candidate_gains(lookup, 1, np.array([8])).sum(axis=1) @ [1.0, 0.999 / 8]
-    assert int(np.argmax(worths)) == int(np.nanargmax(np.round(first, 9))) == search_views(lookup, 1, 8, 1)[1]
+        path = np.array([[8, 30, view]])
+        whole = imitation.spread(lookup.sphere, path, 2)
+        added = tally(lookup, scene, path) - tally(lookup, scene, path[:, :2])
+        np.testing.assert_allclose(now[view].sum(axis=0), added[0], atol=1e-6)
+        added = tally(lookup, scene, whole) - tally(lookup, scene, path)
+        np.testing.assert_allclose(later[view].sum(axis=0), added[0], atol=1e-6)
+    worths = [worth(lookup, scene, np.array([[8, view]]))[0] if view != 8 else -1 for view in range(100)]
+    first, last = (gains.sum(axis=1) for gains in imitation.candidate_gains(lookup, 1, np.array([8]), left=1))
+    assert int(np.argmax(worths)) == int(np.nanargmax(np.round(first @ [1.0, 0.999 / 8], 9)))
+    assert int(np.argmax(worths)) == search_views(lookup, 1, 8, 1)[1]
+    assert np.nanmax(np.abs(last)) == 0.0
+
+
+def test_spread_views_are_the_farthest_of_their_ring(lookup):
+    sphere = lookup.sphere
+    elevation = np.degrees(np.arcsin(sphere.positions[:, 2] / sphere.radius))
+    ring = np.flatnonzero(np.abs(elevation - 60) < 1)
+    (path,) = imitation.spread(sphere, np.array([[3, 70]]), 4)
+    for count in range(2, 6):
+        nearest = [min(sphere.arc(sphere.positions[view], sphere.positions[v]) for v in path[:count]) for view in ring]
+        assert path[count] in ring
+        assert nearest[list(ring).index(path[count])] == pytest.approx(max(nearest), abs=3e-3)
+    assert len(set(path)) == 6
 
 
 def test_labels_tell_which_object_gains(lookup):
@@ -272,7 +291,7 @@ def test_labels_tell_which_object_gains(lookup):
         lookup.object_errors(lookup.fuse(np.array([1]), np.array([views]), np.array([views[-1]])))
         for views in (taken, [*taken, view])
     )
-    gains = imitation.candidate_gains(lookup, 1, np.array(taken))[view]
+    gains = imitation.candidate_gains(lookup, 1, np.array(taken), left=2)[0][view]
     observation = observe(lookup, np.array([1]), np.array([taken]), np.array([2]))[0]
     order, stand_ins = best_verified(observation).tolist(), {}
     for index, position in enumerate(observation.objects.T_world_object[:, :3, 3]):
@@ -294,36 +313,17 @@ def test_explained_gains_are_those_of_the_views(network, observation):
     state = encode([observation, fewer])
     with torch.inference_mode():
         now, later, _ = network(state)
-        explained, after = network.explain(state)
-    np.testing.assert_allclose(explained.sum(dim=2), now, atol=1e-4)
-    np.testing.assert_allclose(after, later, atol=1e-4)
-    np.testing.assert_array_equal(explained[1, :, 3:-1], 0.0)
+        for explained, gains in zip(network.explain(state), (now, later), strict=True):
+            np.testing.assert_allclose(explained.sum(dim=2), gains, atol=1e-4)
+            np.testing.assert_array_equal(explained[1, :, 3:-1], 0.0)
 
 
-def test_later_gains_are_the_learners_own_moves(lookup):
-    """Played out in the training, and by the deployed policy from the same state."""
-    parameters = imitation.ImitationParameters(
-        rounds=1, episodes=6, improve_after=0.0, longest=3, updates=1, explore=0.0, rollouts=4
-    )
-    learner = imitation._Learner(lookup, parameters, Weighing())
-    learner._collect()
-    checked = 0
-    for example in learner.memory:
-        left = example.observation.steps_left
-        played = np.flatnonzero(np.isfinite(example.later[:, 0]))
-        assert (len(played) > 0) == (left > 1)
-        taken = [int(lookup.sphere.nearest(position)) for position in example.observation.positions]
-        scene = next(s for s in (0, 1) if np.array_equal(lookup.objects(s, taken).box, example.observation.objects.box))
-        for view in played[:1]:
-            path = [*taken, int(view)]
-            for remaining in range(left - 1, 0, -1):
-                seen = observe(lookup, np.array([scene]), np.array([path]), np.array([remaining]))
-                path.append(int(imitation.greedy(learner.network)(seen)[0]))
-            scenes = np.array([scene])
-            gained = tally(lookup, scenes, np.array([path])) - tally(lookup, scenes, np.array([[*taken, view]]))
-            np.testing.assert_allclose(example.later[view], gained[0])
-            checked += 1
-    assert checked
+def test_states_in_which_little_is_left_count_more():
+    """Twice the spread of gains is a quarter of the weight, above a floor."""
+    gains = np.random.default_rng(0).normal(size=(2, 1000, 1, 2)).astype(np.float32) * [[[[10.0]]], [[[20.0]]]]
+    weight = imitation._weigh_states(gains).numpy()
+    assert weight.sum() == pytest.approx(2.0, rel=1e-5)
+    assert weight[0] / weight[1] == pytest.approx(gains[1, ..., 0].var() / gains[0, ..., 0].var(), rel=0.01)
 
 
 def test_training_and_deployment_move_alike(lookup, network, policy):
@@ -338,8 +338,8 @@ def test_it_learns_its_way_past_random_and_resumes(tmp_path):
     lookup = BankLookup(synthetic_bank("mug", scenes=3, objects=12))
     starts = all_starts(lookup, 100, 0)
     random = run_named(lookup, "random", starts, 4)
-    settings = {"episodes": 10, "updates": 20, "longest": 4, "steps": 4, "starts": 100, "batch": 48, "rollouts": 4}
-    parameters = imitation.ImitationParameters(rounds=4, evaluate_every=2, improve_after=0.8, **settings)
+    settings = {"episodes": 10, "updates": 20, "longest": 4, "steps": 4, "starts": 100, "batch": 48}
+    parameters = imitation.ImitationParameters(rounds=4, evaluate_every=2, **settings)
     curve = list(imitation.imitate(lookup, lookup, tmp_path, parameters, Weighing(metres_weight=0.05)))
     assert [progress.round for progress in curve] == [2, 4]
     best = max(progress.detection_rate for progress in curve)

@@ -1,16 +1,16 @@
-"""Training ``view-attention`` on a scene bank: imitate what the truth says of every view, then improve on it.
+"""Training ``view-attention`` on a scene bank: imitate what the truth says of every view.
 
-The oracle of a bank says for every candidate view what it would gain, so one visited state teaches a hundred values.
-States are those that the learner itself comes to (DAgger), with some random moves and budgets of every length. In the
-second part of the training the learner also plays its own moves to the end from several candidates of each state, and
-learns what each leaves to be gained: one step of policy iteration a round.
+The truth says for every candidate view what it would gain, and what could still be gained after it, by a fixed rule for
+the moves that remain: views that lie far from all taken ones (:func:`spread`). So one visited state teaches a hundred
+views, and who goes by these values does better than the rule itself (one step of policy iteration). States are those
+that the learner itself comes to (DAgger), with some random moves and budgets of every length.
 """
 
 import json
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from active6d_agent.evaluation import all_starts, measure, observe
 from active6d_agent.lookup import BankLookup
-from active6d_agent.oracle import known, tally
+from active6d_agent.oracle import known
 from active6d_agent.policy import Observation
 from active6d_agent.view_attention import (
     GAINS,
@@ -32,11 +32,14 @@ from active6d_agent.view_attention import (
     save_network,
     value_views,
 )
+from active6d_core.view_sphere import ViewSphere
 
 # Episodes that the network values together: more are no faster and need memory.
-_TOGETHER = 64
+_TOGETHER = 32
 # The weights that play are a mean over about as many steps as four rounds have.
 _MEAN_DECAY = 0.995
+# Variance over a state's views, in objects squared, that counts as none.
+_VARIANCE_FLOOR = 0.1
 
 
 @dataclass(frozen=True)
@@ -53,8 +56,6 @@ class ImitationParameters:
         views: of each state that one step learns from.
         learning_rate: of Adam at first; falls to nothing along a cosine.
         explore: share of random moves.
-        improve_after: share of the rounds after which later gains are rolled out.
-        rollouts: candidates per state to roll out.
         capacity: states kept, the latest.
         starts: validation episodes.
         evaluate_every: rounds between validations.
@@ -68,15 +69,13 @@ class ImitationParameters:
 
     steps: int = 5
     longest: int = 8
-    rounds: int = 80
+    rounds: int = 40
     episodes: int = 32
     updates: int = 50
     batch: int = 96
     views: int = 32
     learning_rate: float = 2e-3
     explore: float = 0.2
-    improve_after: float = 0.4
-    rollouts: int = 6
     capacity: int = 12_000
     starts: int = 150
     evaluate_every: int = 5
@@ -85,10 +84,9 @@ class ImitationParameters:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("explore", "improve_after"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"training: {name} must be in [0, 1], got {getattr(self, name)}")
-        for name in asdict(self).keys() - {"explore", "improve_after", "learning_rate", "object_weight", "seed"}:
+        if not 0 <= self.explore <= 1:
+            raise ValueError(f"training: explore must be in [0, 1], got {self.explore}")
+        for name in asdict(self).keys() - {"explore", "learning_rate", "object_weight", "seed"}:
             if getattr(self, name) < 1:
                 raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
         if not self.learning_rate > 0:
@@ -125,7 +123,7 @@ class Example:
     Attributes:
         observation: the state.
         now: (M, n + 1, 2) :func:`candidate_gains`.
-        later: (M, 2) gains of the learner's moves after it, NaN where they were not played.
+        later: (M, n + 1, 2) likewise.
     """
 
     observation: Observation
@@ -231,28 +229,44 @@ def roll_out(
     return views
 
 
-def candidate_gains(lookup: BankLookup, scene: int, views: np.ndarray) -> np.ndarray:
-    """What each view adds to the (v,) views taken, NaN for those.
+def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
+    """(E, v) views to (E, v + moves): each next one is the view at 60 degrees farthest from all taken ones, the nearest
+    of equals. Of the rules that need nothing but geometry this finds most objects."""
+    arcs = sphere.arc(sphere.positions[:, None], sphere.positions)
+    elevation = np.arcsin(sphere.positions[:, 2] / sphere.radius)
+    ring = np.flatnonzero(np.isclose(elevation, elevation[np.abs(elevation - np.pi / 3).argmin()]))
+    for _ in range(moves):
+        farness = arcs[paths][:, :, ring].min(axis=1) - 1e-3 * arcs[paths[:, -1]][:, ring]
+        paths = np.column_stack([paths, ring[farness.argmax(axis=1)]])
+    return paths
+
+
+def candidate_gains(lookup: BankLookup, scene: int, views: np.ndarray, left: int) -> tuple[np.ndarray, np.ndarray]:
+    """What each view adds to the (v,) views taken, and what :func:`spread` adds in the moves that are left after it.
 
     Returns:
-        (M, n + 1, 2) gains (:func:`~active6d_agent.oracle.known`) of the true objects that the n accumulated ones are
-        best for, in the order of :func:`~active6d_agent.view_attention.best_verified`; of several for one true object
-        the best has the gain. Last, what all true objects gain that none stands for.
+        Twice (M, n + 1, 2), NaN for views taken: gains (:func:`~active6d_agent.oracle.known`) of the true objects that
+        the n accumulated ones are best for, in the order of :func:`~active6d_agent.view_attention.best_verified`; of
+        several for one true object the best has the gain. Last, what all true objects gain that none stands for.
     """
     free = np.setdiff1d(np.arange(len(lookup.sphere)), views)
-    paths = np.column_stack([np.tile(views, (len(free) + 1, 1)), np.append(free, views[-1])])
-    after = known(lookup, np.full(len(paths), scene), paths)
-    added = after[:-1] - after[-1]
+    paths = np.column_stack([np.tile(views, (len(free), 1)), free])
+    before = known(lookup, np.array([scene]), views[None])
+    after, ended = (
+        known(lookup, np.full(len(free), scene), each) for each in (paths, spread(lookup.sphere, paths, left - 1))
+    )
     rows = lookup.fuse(np.array([scene]), views[None], views[-1:]).objects[0]
-    stands_for, best = np.unique(lookup.nearest_object[rows], return_index=True)
-    gains = np.full((len(lookup.sphere), len(rows) + 1, GAINS), np.nan)
-    gains[free] = 0.0
-    gains[free[:, None], best] = added[:, stands_for]
-    gains[free, -1] = added.sum(axis=1) - added[:, stands_for].sum(axis=1)
     order = np.argsort(-lookup.verification[rows], kind="stable")
-    kept, left_out = order[:MAX_OBJECTS], order[MAX_OBJECTS:]
-    gains[free, -1] += gains[free[:, None], left_out].sum(axis=1)
-    return gains[:, np.append(kept, len(rows))]
+    stands_for, best = np.unique(lookup.nearest_object[rows], return_index=True)
+    column = np.argsort(order)[best]
+    told = column < MAX_OBJECTS
+    stands_for, column = stands_for[told], column[told]
+    gains = np.full((2, len(lookup.sphere), min(len(rows), MAX_OBJECTS) + 1, GAINS), np.nan)
+    gains[:, free] = 0.0
+    for part, added in zip(gains, (after - before, ended - after), strict=True):
+        part[free[:, None], column] = added[:, stands_for]
+        part[free, -1] = added.sum(axis=1) - added[:, stands_for].sum(axis=1)
+    return gains[0], gains[1]
 
 
 class _Learner:
@@ -266,15 +280,10 @@ class _Learner:
         # What plays and is kept is a running mean of the weights: it does better on other scenes than the latest.
         self._average = AveragedModel(self._trained, avg_fn=_running_mean).eval()
         self.network: ViewAttention = self._average.module
-        self.network.weighing = replace(weighing, lookahead=0.0)
+        self.network.weighing = weighing
         self.rng = np.random.default_rng(parameters.seed)
         self.memory: deque[Example] = deque(maxlen=parameters.capacity)
         self.round, self.states = 0, 0
-
-    @property
-    def improves(self) -> bool:
-        """Whether later gains are played out by now."""
-        return self.round >= self.parameters.improve_after * self.parameters.rounds
 
     def restore(self, path: Path) -> tuple[tuple[float, float], float]:
         """Take the weights of an earlier training; the best so far and the seconds spent."""
@@ -292,8 +301,6 @@ class _Learner:
     def advance(self) -> float:
         """One round; its mean loss."""
         self._collect()
-        if self.improves:
-            self.network.weighing = self._weighing  # later gains count once they are learned
         share = self.round / self.parameters.rounds
         for group in self.optimizer.param_groups:
             group["lr"] = self.parameters.learning_rate * (0.02 + 0.98 * (1 + np.cos(np.pi * share)) / 2)
@@ -314,12 +321,12 @@ class _Learner:
         def choose(observations: list[Observation]) -> np.ndarray:
             running = np.flatnonzero(left > 0)
             values = _worths(self.network, observations)
-            nows = [candidate_gains(lookup, s, v[v >= 0]) for s, v in zip(scene[running], views[running], strict=True)]
-            laters = self._play_out(observations, scene[running], views[running], nows, values)
-            self.memory.extend(map(Example, observations, nows, laters))
+            states = zip(scene[running], views[running], left[running], strict=True)
+            gains = [candidate_gains(lookup, index, taken[taken >= 0], moves) for index, taken, moves in states]
+            self.memory.extend(Example(seen, *both) for seen, both in zip(observations, gains, strict=True))
             self.states += len(observations)
-            weigh = [1.0, self._weighing.error_weight]
-            best = [self._best(now.sum(axis=1) @ weigh, worth, lead) for now, worth in zip(nows, values, strict=True)]
+            truths = [(now + later).sum(axis=1) @ [1.0, self._weighing.error_weight] for now, later in gains]
+            best = [self._best(truth, worth, lead) for truth, worth in zip(truths, values, strict=True)]
             views[running, (views[running] >= 0).sum(axis=1)] = best
             left[running] -= 1
             return np.array(best)
@@ -332,49 +339,19 @@ class _Learner:
             return int(self.rng.choice(np.flatnonzero(np.isfinite(worth))))
         return int(np.nanargmax(truth) if self.rng.random() < lead else worth.argmax())
 
-    def _play_out(
-        self, observations: list[Observation], scene: np.ndarray, views: np.ndarray, nows: list, values: np.ndarray
-    ) -> list[np.ndarray]:
-        """(M, 2) later gains per state: of the most valued views, and of as many drawn ones."""
-        laters = [np.full((len(now), GAINS), np.nan) for now in nows]
-        wanted = [
-            (state, view)
-            for state, (observation, worth) in enumerate(zip(observations, values, strict=True))
-            if self.improves and observation.steps_left > 1
-            for view in self._to_play(worth)
-        ]
-        if not wanted:
-            return laters
-        state, view = np.array(wanted).T
-        left = np.array([observations[index].steps_left - 1 for index in state])
-        after = np.column_stack([views[state], np.full(len(state), -1)])
-        after[np.arange(len(state)), (after >= 0).sum(axis=1)] = view
-        ended = roll_out(self.lookup, greedy(self.network), scene[state], after, left)
-        gained = tally(self.lookup, scene[state], ended) - tally(self.lookup, scene[state], after)
-        for index, of, gain in zip(state, view, gained, strict=True):
-            laters[index][of] = gain
-        return laters
-
-    def _to_play(self, worth: np.ndarray) -> np.ndarray:
-        candidates = np.flatnonzero(np.isfinite(worth))
-        ranked = candidates[np.argsort(-worth[candidates], kind="stable")]
-        top = ranked[: (self.parameters.rollouts + 1) // 2]
-        rest = ranked[len(top) :]
-        return np.append(top, self.rng.permutation(rest)[: self.parameters.rollouts - len(top)])
-
     def _update(self) -> float:
         drawn = [self.memory[i] for i in self.rng.integers(len(self.memory), size=self.parameters.batch)]
         state = encode([example.observation for example in drawn])
         some = self.rng.permutation(len(self.lookup.sphere))[: self.parameters.views]
-        if self.improves:
-            # Few views of a state were played out; learn from those of every state.
-            played = [np.flatnonzero(np.isfinite(example.later[:, 0])) for example in drawn]
-            some = np.unique(np.concatenate([some, *(self.rng.permutation(each)[:1] for each in played)]).astype(int))
         state["views"] = state["views"][some]
-        now, later = self._trained.explain(state)
-        truth = _labels(drawn, some, now.shape[2])
-        loss = _loss(now.sum(dim=2), truth.sum(axis=2)) + self.parameters.object_weight * _loss_of_objects(now, truth)
-        loss = loss + _loss(later, np.stack([example.later[some] for example in drawn]))
+        nows, laters = self._trained.explain(state)
+        now, later = (
+            _labels([getattr(each, name) for each in drawn], some, nows.shape[2]) for name in ("now", "later")
+        )
+        # What comes first is learned by itself, too: it is surer than the sum, which decides.
+        loss = _loss(nows, now, self.parameters.object_weight) + _loss(
+            nows + laters, now + later, self.parameters.object_weight
+        )
         self.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self._trained.parameters(), 1.0)
@@ -388,28 +365,34 @@ def _running_mean(mean: torch.Tensor, value: torch.Tensor, count: torch.Tensor) 
     return torch.lerp(value, mean, torch.clamp((1 + count) / (10 + count), max=_MEAN_DECAY))
 
 
-def _labels(drawn: list[Example], views: np.ndarray, count: int) -> np.ndarray:
-    """(B, M', count, 2) gains now at (M',) views, padded before what no object stands for."""
-    padded = np.zeros((len(drawn), len(views), count, GAINS))
-    for row, example in zip(padded, drawn, strict=True):
-        own = example.now[views]
-        row[:, : own.shape[1] - 1], row[:, -1] = own[:, :-1], own[:, -1]
+def _labels(gains: list[np.ndarray], views: np.ndarray, count: int) -> np.ndarray:
+    """(B, M', count, 2) gains of (M',) views, padded before what no object stands for."""
+    padded = np.zeros((len(gains), len(views), count, GAINS), np.float32)
+    for row, own in zip(padded, gains, strict=True):
+        row[:, : own.shape[1] - 1], row[:, -1] = own[views, :-1], own[views, -1]
     return padded
 
 
-def _loss_of_objects(predicted: torch.Tensor, truth: np.ndarray) -> torch.Tensor:
-    """Square error of (B, M, n, 2) gains, summed over objects, where they are known."""
-    target = torch.from_numpy(truth.astype(np.float32))
-    known = torch.isfinite(target[:, :, -1])
-    off = ((predicted - torch.nan_to_num(target)) ** 2).sum(dim=2)
-    return torch.where(known, off, 0.0).sum() / known.sum().clamp(min=1)
-
-
-def _loss(predicted: torch.Tensor, truth: np.ndarray) -> torch.Tensor:
-    """Square error of (B, M, 2) gains where they are known; differences between the views of a state count most."""
-    target = torch.from_numpy(truth.astype(np.float32))
-    known = torch.isfinite(target)
+def _loss(predicted: torch.Tensor, truth: np.ndarray, object_weight: float) -> torch.Tensor:
+    """Square error of (B, M, n + 1, 2) gains where they are known: of their sums over the objects, of which the
+    differences between the views of a state count most, and of each object's."""
+    target = torch.from_numpy(truth)
+    known = torch.isfinite(target[:, :, -1:, :1])
     off = torch.where(known, predicted - torch.nan_to_num(target), 0.0)
-    level = off.sum(dim=1) / known.sum(dim=1).clamp(min=1)
-    about = torch.where(known, off - level[:, None], 0.0)
-    return (about**2).sum() / known.sum().clamp(min=1) + 0.25 * (level**2).mean()
+    count = known.sum(dim=1, keepdim=True).clamp(min=1)
+    weight = _weigh_states(truth)[:, None, None]
+    total = off.sum(dim=2, keepdim=True)
+    level = total.sum(dim=1, keepdim=True) / count
+    about = torch.where(known, total - level, 0.0) ** 2 / count * weight[..., None]
+    own = off**2 / count * weight[..., None]
+    return (about.sum() + object_weight * own.sum()) / len(truth) + 0.25 * (level[:, 0, 0] ** 2 * weight[:, 0]).mean()
+
+
+def _weigh_states(truth: np.ndarray) -> torch.Tensor:
+    """(B,) weights that sum to B: the less the gains of a state's views differ, the more each counts.
+
+    The first moves find many objects and the last ones few, which a plain square error hardly notices, though finding
+    them decides who wins.
+    """
+    weight = 1.0 / (np.nanvar(truth[..., 0].sum(axis=2), axis=1) + _VARIANCE_FLOOR)
+    return torch.from_numpy((weight / weight.mean()).astype(np.float32))

@@ -50,9 +50,9 @@ class Weighing:
         ValueError: a weight is out of range.
     """
 
-    metres_weight: float = 0.1
+    metres_weight: float = 0.05
     error_weight: float = 0.5
-    lookahead: float = 1.0
+    lookahead: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("metres_weight", "error_weight"):
@@ -162,15 +162,12 @@ class ViewAttention(nn.Module):
         return gains[..., :GAINS], gains[..., GAINS:] * more, seen.attention
 
     def explain(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """What :meth:`forward` adds up, to learn from: (B, M, n + 1, 2) gains of going there next, of each object and
-        at the end of the view as a whole; (B, M, 2) gains after that. Only the former shape what the layers before
-        see: the latter are sums over many moves, and say next to nothing about a single object."""
+        """What :meth:`forward` adds up, to learn from: twice (B, M, n + 1, 2), gains of going there next and of the
+        moves after that, of each object, and at the end of the view as a whole."""
         seen = self._look(state)
-        mask, more = seen.mask[:, None, :, None], (state["left"] > 1)[:, None, None]
-        rest = self.per_view(seen.whole)[:, :, None]
-        now = torch.cat([self.per_object(seen.pairs) * mask, rest], dim=2)[..., :GAINS]
-        own = (self.per_object(seen.pairs.detach()) * mask).sum(dim=2)
-        return now, (own + self.per_view(seen.whole.detach()))[..., GAINS:] * more
+        own = self.per_object(seen.pairs) * seen.mask[:, None, :, None]
+        gains = torch.cat([own, self.per_view(seen.whole)[:, :, None]], dim=2)
+        return gains[..., :GAINS], gains[..., GAINS:] * (state["left"] > 1)[:, None, None, None]
 
     def _look(self, state: dict[str, torch.Tensor]) -> "_Seen":
         objects, pairs, views = self.describe(state)
