@@ -10,14 +10,14 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch.optim.swa_utils import AveragedModel
 
-from active6d_agent.evaluation import all_starts, measure, observe
+from active6d_agent.evaluation import all_starts, measure, observe, run_named
 from active6d_agent.lookup import BankLookup
 from active6d_agent.oracle import known
 from active6d_agent.policy import Observation
@@ -38,6 +38,10 @@ from active6d_core.view_sphere import ViewSphere
 _TOGETHER = 32
 # The weights that play are a mean over about as many steps as four rounds have.
 _MEAN_DECAY = 0.995
+# What is tried for the weighing.
+_LOOKAHEADS = (0.0, 0.25, 0.5, 1.0)
+_METRES_WEIGHTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+_MEASURED = ("detection_rate", "e_add_mm", "distance_m")
 # Variance over a state's views, in objects squared, that counts as none.
 _VARIANCE_FLOOR = 0.1
 
@@ -77,7 +81,7 @@ class ImitationParameters:
     learning_rate: float = 2e-3
     explore: float = 0.2
     capacity: int = 12_000
-    starts: int = 150
+    starts: int = 300
     evaluate_every: int = 5
     object_weight: float = 1.0
     hidden: int = 32
@@ -143,7 +147,8 @@ def imitate(
     """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
 
     ``folder`` receives ``curve.jsonl``, ``best.safetensors`` (highest validation detection rate, lower e_ADD of equals)
-    and ``latest.safetensors``, each with its JSON.
+    and ``latest.safetensors``, each with its JSON. At the end the best is given the weighing that suits it
+    (:func:`choose_weighing`).
 
     Args:
         train: scenes to train on.
@@ -180,6 +185,40 @@ def imitate(
             save_network(learner.network, folder / "best.safetensors", train.model.name, made)
         save_network(learner.network, latest, train.model.name, {**made, "best": best})
         yield progress
+    settle(folder / "best.safetensors", validation, starts, parameters.steps)
+
+
+def settle(path: Path, validation: BankLookup, starts: np.ndarray, steps: int) -> None:
+    """Give stored weights the weighing of :func:`choose_weighing`; for its arguments see there."""
+    network = load_network(path, validation.model.name)
+    provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
+    network.weighing = choose_weighing(network, validation, starts, steps)
+    settled = dict(zip(_MEASURED, validate(network, validation, starts, steps), strict=True))
+    save_network(network, path, validation.model.name, {**provenance, "settled": settled})
+
+
+def choose_weighing(network: ViewAttention, validation: BankLookup, starts: np.ndarray, steps: int) -> Weighing:
+    """The weight of later gains that finds most on the validation scenes, then likewise that of metres, among those
+    that make no longer ways than the random policy does.
+
+    Args:
+        network: whose weighing is the beginning, and stays as it is otherwise.
+        validation: scenes to choose on.
+        starts: (E, 2) scenes and first views.
+        steps: moves T.
+    """
+    most_metres = run_named(validation, "random", starts, steps).distance_m.mean()
+    given, weighing = network.weighing, network.weighing
+    for name, values in (("lookahead", _LOOKAHEADS), ("metres_weight", _METRES_WEIGHTS)):
+        results = []
+        for value in values:
+            network.weighing = replace(weighing, **{name: value})
+            rate, error, metres = validate(network, validation, starts, steps)
+            fits = name == "lookahead" or metres <= most_metres
+            results.append((fits, rate if fits else -metres, -error, network.weighing))
+        weighing = max(results, key=lambda result: result[:3])[-1]
+    network.weighing = given
+    return weighing
 
 
 def validate(network: ViewAttention, lookup: BankLookup, starts: np.ndarray, steps: int) -> tuple[float, float, float]:
