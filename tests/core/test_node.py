@@ -164,7 +164,8 @@ class Ended(DepthNode):
         # The context ends and nobody wakes the executor, as when rclpy's wake comes before the end.
         threading.Timer(0.5, lambda: rclpy.get_default_context().handle.shutdown()).start()
 
-node.run_node({"defect": Defective, "end": Ended}.get(sys.argv[1], DepthNode))
+kind = {"defect": Defective, "end": Ended}.get(sys.argv[1], DepthNode)
+node.run_node(kind, sys.argv[:1] + sys.argv[2:])
 """
 
 
@@ -180,6 +181,7 @@ def run_a_node(*arguments):
     [
         (["defect"], 1, "Traceback"),
         (["parameter", "--ros-args", "-p", "gain:=-1.0"], 2, "error: depth_node: parameter 'gain' is -1.0"),
+        (["parameter", "-p", "gain:=1.0"], 2, "error: '-p' is not for a node; parameters come after --ros-args"),
     ],
 )
 def test_exit_code_two_is_for_parameters_and_a_defect_shows_its_traceback(arguments, code, text):
@@ -187,6 +189,12 @@ def test_exit_code_two_is_for_parameters_and_a_defect_shows_its_traceback(argume
     assert ended.returncode == code
     assert text in ended.stderr
     assert ("Traceback" in ended.stderr) == (code == 1)
+
+
+def test_help_shows_how_parameters_are_given():
+    ended = run_a_node("help", "--help")
+    assert ended.returncode == 0
+    assert "--ros-args -p NAME:=VALUE" in ended.stdout
 
 
 def test_an_end_that_wakes_nobody_still_ends_the_node():

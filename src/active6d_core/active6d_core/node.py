@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -22,6 +23,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from active6d_core.conversions import HARDWARE_ID, MessageError, ns_to_stamp
@@ -307,7 +309,8 @@ class StampSynchronizer:
 
 
 def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> None:
-    """The main function of every executable: spin one node until interrupted. Exit code 2 on a bad parameter."""
+    """The main function of every executable: spin one node until interrupted. Exit code 2 on bad arguments."""
+    _refuse_words(list(sys.argv if args is None else args))
     rclpy.init(args=args)
     node = None
     try:
@@ -337,6 +340,19 @@ def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> N
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _refuse_words(arguments: list[str]) -> None:
+    """End with usage, or with an error: rclpy would drop silently what stands before ``--ros-args``."""
+    words = remove_ros_args(arguments)[1:]
+    if not words:
+        return
+    usage = f"usage: {Path(arguments[0]).stem} [--ros-args -p NAME:=VALUE ... --params-file FILE]"
+    if set(words) & {"-h", "--help"}:
+        print(f"{usage}\nparameters and topics: docs/graph.md, or `ros2 param describe` while it runs")
+        sys.exit(0)
+    print(f"error: '{words[0]}' is not for a node; parameters come after --ros-args\n{usage}", file=sys.stderr)
+    sys.exit(2)
 
 
 def _qos(latched: bool, depth: int) -> QoSProfile:
