@@ -267,7 +267,7 @@ def test_the_node_chooses_what_the_environment_would(episode, tmp_path):
         ({"steps": -1}, "parameter 'steps' is -1"),
         ({"policy_parameters": "[1]"}, "parameter 'policy_parameters' must be a YAML mapping"),
         ({"policy_parameters": "{a: ["}, "parameter 'policy_parameters'"),
-        ({"policy_parameters": "{sigma: 1}"}, "policy 'lowest-score' has no parameter 'sigma'"),
+        ({"policy": "random", "policy_parameters": "{sigma: 1}"}, "policy 'random' has no parameter 'sigma'"),
         ({"object": "teapot"}, "unknown object 'teapot'"),
         ({"reach_views": [100]}, "parameter 'reach_views' must be within 0 and 99"),
         ({"reach_elevation_min_degrees": 80.0}, "leave no view"),

@@ -128,7 +128,7 @@ def test_images_are_the_simulators(record, scene, settings):
 def test_perception_and_policy_are_the_core_functions(record):
     model = load_object("mug")
     estimator, verifier, fusion = create_estimator("geometric", model), Verifier(model), SceneFusion(model)
-    policy = create_policy("lowest-score", model)
+    policy = create_policy("auto", model)
     policy.reset(np.random.default_rng([3, record.steps[0].stamp]))
     found_any = 0
     for index, step in enumerate(record.steps):

@@ -10,6 +10,7 @@ The network predicts what a view gains at once and what can still be gained afte
 :mod:`active6d_agent.imitation`.
 """
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -131,6 +132,7 @@ class ViewAttention(nn.Module):
     ) -> None:
         super().__init__()
         self.diameter, self.axis, self.hidden, self.weighing = diameter, axis, hidden, weighing
+        self.register_buffer("_axis", None if axis is None else torch.tensor(axis), persistent=False)
         self.of_object = nn.Sequential(nn.Linear(_OBJECT_FEATURES, hidden), nn.ReLU())
         self.in_context = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.ReLU())
         self.of_pair = nn.Linear(_PAIR_FEATURES, hidden)
@@ -241,9 +243,9 @@ class ViewAttention(nn.Module):
 
     def _sides(self, directions: torch.Tensor) -> torch.Tensor:
         """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
-        if self.axis is None:
+        if self._axis is None:
             return directions
-        axial = directions @ torch.tensor(self.axis, dtype=directions.dtype, device=directions.device)
+        axial = directions @ self._axis
         return torch.stack([axial, (1 - axial**2).clamp(min=0.0).sqrt(), torch.zeros_like(axial)], dim=-1)
 
     def _describe_objects(
@@ -349,8 +351,9 @@ def trace(network: ViewAttention) -> nn.Module:
     sphere = ViewSphere()
     nothing = Observation(SceneObjects.empty(), sphere.positions[:1], sphere, np.ones(len(sphere), bool), 1)
     state = encode([nothing])
-    # torch calls tracing deprecated, but what shall replace it needs a compiler on the robot.
-    with torch.inference_mode():
+    with torch.inference_mode(), warnings.catch_warnings():
+        # torch calls tracing deprecated, but what shall replace it needs a compiler on the robot.
+        warnings.simplefilter("ignore", DeprecationWarning)
         traced = torch.jit.trace(network, (state,), strict=False, check_trace=False)
         # The first two calls optimise it; no decision should wait for that.
         for _ in range(2):
