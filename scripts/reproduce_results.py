@@ -18,13 +18,14 @@ PAGE = ROOT / "docs/results.md"
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
 
 
-def run(job: Job, object_name: str, threads: int) -> None:
+def run(job: Job, object_name: str) -> None:
     """Run one command in the repository.
 
     Raises:
         RuntimeError: it failed; its last words.
     """
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    # Networks this small gain nothing from threads, and wait for each other's where several commands run.
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "active6d_bringup", *job.arguments(object_name)]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     if done.returncode:
@@ -36,9 +37,8 @@ def run_all(jobs: list[tuple[Job, str]], workers: int) -> list[str]:
     failures: list[str] = []
     if not jobs:
         return failures
-    threads = max(1, (os.cpu_count() or 1) // workers)
     with ThreadPoolExecutor(workers) as pool, progress_bar() as bar:
-        running = {pool.submit(run, job, name, threads): f"{job.name}, {name}" for job, name in jobs}
+        running = {pool.submit(run, job, name): f"{job.name}, {name}" for job, name in jobs}
         task = bar.add_task(f"measuring {', '.join(dict.fromkeys(job.name for job, _ in jobs))}", total=len(jobs))
         for done in as_completed(running):
             bar.update(task, advance=1)
