@@ -11,9 +11,9 @@ from active6d_agent.policy import (
     choose_policy,
     create_policy,
     list_policies,
-    shipped_weights,
     softmax,
     uniform_attention,
+    weights_path,
 )
 from active6d_core.view_sphere import ViewSphere
 
@@ -249,15 +249,15 @@ def test_attention_weights_sum_to_one(logits):
 
 def test_auto_is_the_learned_policy_where_its_weights_ship(model, tmp_path, monkeypatch):
     monkeypatch.setattr(policy_module, "SHIPPED_WEIGHTS", tmp_path)
-    assert choose_policy("mug") == "lowest-score"
-    assert type(create_policy("auto", model)) is type(create_policy("lowest-score", model))
+    assert choose_policy("mug") == "unidirectional"
+    assert type(create_policy("auto", model)) is type(create_policy("unidirectional", model))
     (tmp_path / "view-attention_mug.safetensors").touch()
     assert choose_policy("mug") == "view-attention"
-    assert choose_policy("bunny") == "lowest-score"
+    assert choose_policy("bunny") == "unidirectional"
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "view-attention_bunny.safetensors").touch()
     monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(mine))
     assert choose_policy("bunny") == "view-attention"
-    assert shipped_weights("view-attention", "bunny") == mine / "view-attention_bunny.safetensors"
-    assert shipped_weights("view-attention", "mug") == tmp_path / "view-attention_mug.safetensors"
+    assert weights_path("view-attention", "bunny") == mine / "view-attention_bunny.safetensors"
+    assert weights_path("view-attention", "mug") == tmp_path / "view-attention_mug.safetensors"

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from active6d_agent.environment import MAX_OBJECTS
-from active6d_agent.policy import Decision, Observation, register_policy, shipped_weights
+from active6d_agent.policy import Decision, Observation, register_policy, weights_path
 from active6d_agent.weights_file import load_weights, save_weights
 from active6d_core.object_model import ObjectModel
 
@@ -132,7 +132,7 @@ class AttentionPolicy:
     """
 
     def __init__(self, model: ObjectModel, weights: str = "") -> None:
-        self.network = load_network(Path(weights) if weights else shipped_weights("attention", model.name))
+        self.network = load_network(Path(weights) if weights else weights_path("attention", model.name))
 
     def reset(self, rng: np.random.Generator) -> None:
         """The mean is taken, so nothing is random here."""

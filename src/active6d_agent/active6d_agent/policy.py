@@ -104,14 +104,14 @@ class Policy(Protocol):
         """The next move; a policy stops when the observation leaves it no candidate."""
 
 
-def shipped_weights(policy: str, object_name: str) -> Path:
+def weights_path(policy: str, object_name: str) -> Path:
     """Where weights of a policy for an object are, or would be: beside its description, or where shipped ones are."""
     return find_beside(f"{policy}_{object_name}.safetensors", SHIPPED_WEIGHTS)
 
 
 def choose_policy(object_name: str) -> str:
-    """What ``auto`` stands for: the learned policy where there are weights for the object, else the best heuristic."""
-    return "view-attention" if shipped_weights("view-attention", object_name).is_file() else "lowest-score"
+    """What ``auto`` stands for: the learned policy where there are weights, else the rule that finds most."""
+    return "view-attention" if weights_path("view-attention", object_name).is_file() else "unidirectional"
 
 
 _BASELINES = "random", "unidirectional", "max-distance", "lowest-score", "single-view", "entropy"

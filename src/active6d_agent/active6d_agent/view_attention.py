@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from active6d_agent.policy import Decision, Observation, register_policy, shipped_weights
+from active6d_agent.policy import Decision, Observation, register_policy, weights_path
 from active6d_agent.weights_file import load_weights, save_weights
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel
@@ -399,7 +399,7 @@ class ViewAttentionPolicy:
         lookahead: float | None = None,
         stop_below: float = 0.0,
     ) -> None:
-        path = Path(weights) if weights else shipped_weights("view-attention", model.name)
+        path = Path(weights) if weights else weights_path("view-attention", model.name)
         network = load_network(path, model.name)
         given = {"metres_weight": metres_weight, "error_weight": error_weight, "lookahead": lookahead}
         given = {name: value for name, value in given.items() if value is not None}

@@ -30,7 +30,7 @@ def load_weights(path: Path, policy: str, build: Callable[[dict], _Module]) -> _
     Raises:
         ValueError: a file is missing, damaged or does not fit; one line that names the file and what to do.
     """
-    train = f"active6d train policy --policy {policy}"
+    train = f"active6d train policy --object NAME --policy {policy} --export DIR"
     if not path.is_file():
         raise ValueError(f"{path}: no weights of the {policy} policy here; train them with: {train}")
     try:

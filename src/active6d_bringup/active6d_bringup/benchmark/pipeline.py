@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from active6d_agent.policy import Observation, Policy, create_policy, shipped_weights
+from active6d_agent.policy import Observation, Policy, create_policy, weights_path
 from active6d_agent.view_attention import new_network, save_network
 from active6d_bringup.benchmark.graph import PreparedViews, prepare_views
 from active6d_core.hypotheses import Hypotheses
@@ -108,7 +108,7 @@ def _milliseconds(times: LastViewTimes) -> dict[str, float]:
 
 def _make_policy(name: str, model: ObjectModel) -> tuple[Policy, bool]:
     """The policy, and whether its weights are trained ones."""
-    if name != "view-attention" or shipped_weights(name, model.name).is_file():
+    if name != "view-attention" or weights_path(name, model.name).is_file():
         return create_policy(name, model), True
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "untrained.safetensors"

@@ -190,7 +190,7 @@ def _compare_seeds(
     import json
 
     from active6d_agent.evaluation import Intervals, all_starts, describe, run_named
-    from active6d_agent.policy import shipped_weights
+    from active6d_agent.policy import weights_path
 
     validation, intervals, rows = all_starts(lookups["val"], sample, seed), Intervals(starts[:, 0], seed), []
     with progress_bar() as bar:
@@ -198,7 +198,7 @@ def _compare_seeds(
             own = {"weights": str(path)}
             chosen_on = run_named(lookups["val"], name, validation, steps, parameters=own)
             results = run_named(lookups["test"], name, starts, steps, parameters=own)
-            shipped = shipped_weights(name, lookups["test"].model.name)
+            shipped = weights_path(name, lookups["test"].model.name)
             curve = (path.parent / "curve.jsonl").read_text().splitlines()
             rows.append(
                 {

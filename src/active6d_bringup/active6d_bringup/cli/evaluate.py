@@ -43,7 +43,10 @@ def evaluate(
     from active6d_agent.evaluation import evaluate as run_all
     from active6d_agent.lookup import BankLookup
     from active6d_bringup.cli.episode import parse_overrides
+    from active6d_sim.scene_store import SPLITS
 
+    if split not in SPLITS:
+        raise ValueError(f"--split '{split}' is not among {', '.join(SPLITS)}")
     bank = load_bank(find_bank(object_name, split, banks))
     if steps >= len(bank.sphere):
         raise ValueError(f"--steps {steps}: the grid of {len(bank.sphere)} views leaves {len(bank.sphere) - 1} moves")
