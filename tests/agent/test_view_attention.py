@@ -1,5 +1,6 @@
 """The policy that values every view: what must not matter does not, its labels are the truth, and it learns."""
 
+import copy
 import json
 import time
 from dataclasses import replace
@@ -193,6 +194,22 @@ def test_the_deployed_network_is_the_trained_one(network, lookup):
             each = replace(seen, objects=seen.objects.take(np.arange(n)))
             for before, after in zip(values(network, [each]), values(deployed, [each]), strict=True):
                 np.testing.assert_array_equal(after, before)
+
+
+def test_policies_of_one_file_share_its_network_until_it_changes(network, tmp_path, lookup, observation):
+    path = tmp_path / "weights.safetensors"
+    save_network(network, path, "mug")
+    first, second = (create_policy("view-attention", lookup.model, weights=str(path)) for _ in range(2))
+    assert first._network is second._network
+    before = first.decide(observation).attention
+    other = copy.deepcopy(network)
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter.mul_(2.0)
+    save_network(other, path, "mug")
+    after = create_policy("view-attention", lookup.model, weights=str(path)).decide(observation).attention
+    assert np.abs(after - before).max() > 1e-3
+    np.testing.assert_array_equal(first.decide(observation).attention, before)
 
 
 def test_a_decision_leaves_the_threads_as_they_were(policy, observation):
@@ -396,7 +413,7 @@ def test_a_decision_is_fast(policy, lookup):
     ("name", "damage", "message"),
     [
         ("weights.safetensors", lambda path: path.write_bytes(b"no tensors"), "no weights of the view-attention"),
-        ("weights.safetensors", lambda path: path.unlink(), "active6d train policy --policy view-attention"),
+        ("weights.safetensors", lambda path: path.unlink(), "active6d train policy --object NAME --policy view-attention"),
         ("weights.json", lambda path: path.unlink(), "no weights of the view-attention policy"),
         ("weights.json", lambda path: path.write_text('{"policy": "attention"}'), "weights of policy 'attention'"),
         (

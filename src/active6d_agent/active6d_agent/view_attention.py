@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -361,6 +362,14 @@ def trace(network: ViewAttention) -> nn.Module:
     return traced
 
 
+@lru_cache(maxsize=8)
+def _deployed(path: Path, object_name: str, written: int) -> tuple[nn.Module, Weighing]:
+    """The traced network of a file as it was ``written`` (ns), and its weighing; an evaluation makes hundreds of
+    policies, which share one."""
+    network = load_network(path, object_name)
+    return trace(network), network.weighing
+
+
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """One observation is too little work to share: on a busy machine its threads wait for each other a hundred times
@@ -400,11 +409,11 @@ class ViewAttentionPolicy:
         stop_below: float = 0.0,
     ) -> None:
         path = Path(weights) if weights else weights_path("view-attention", model.name)
-        network = load_network(path, model.name)
+        written = path.stat().st_mtime_ns if path.is_file() else 0
+        self._network, weighing = _deployed(path, model.name, written)
         given = {"metres_weight": metres_weight, "error_weight": error_weight, "lookahead": lookahead}
         given = {name: value for name, value in given.items() if value is not None}
-        self._weighing = replace(network.weighing, **given)
-        self._network = trace(network)
+        self._weighing = replace(weighing, **given)
         self._stop_below = stop_below
 
     def reset(self, rng: np.random.Generator) -> None:
