@@ -413,7 +413,7 @@ def test_a_decision_is_fast(policy, lookup):
     ("name", "damage", "message"),
     [
         ("weights.safetensors", lambda path: path.write_bytes(b"no tensors"), "no weights of the view-attention"),
-        ("weights.safetensors", lambda path: path.unlink(), "active6d train policy --object NAME --policy view-attention"),
+        ("weights.safetensors", lambda path: path.unlink(), "active6d train policy --object NAME --policy"),
         ("weights.json", lambda path: path.unlink(), "no weights of the view-attention policy"),
         ("weights.json", lambda path: path.write_text('{"policy": "attention"}'), "weights of policy 'attention'"),
         (
