@@ -2,8 +2,7 @@
 
 The truth says for every candidate view what it would gain, and what could still be gained after it, by a fixed rule for
 the moves that remain: views that lie far from all taken ones (:func:`spread`). So one visited state teaches a hundred
-views, and who goes by these values does better than the rule itself (one step of policy iteration). States are those
-that the learner itself comes to (DAgger), with some random moves and budgets of every length.
+views. States are those that the learner itself comes to (DAgger), with some random moves and budgets of every length.
 """
 
 import json
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch.optim.swa_utils import AveragedModel
 
-from active6d_agent.evaluation import all_starts, measure, observe, run_named
+from active6d_agent.evaluation import MEASURES, all_starts, measure, observe, run_named
 from active6d_agent.lookup import BankLookup
 from active6d_agent.oracle import known
 from active6d_agent.policy import Observation
@@ -41,7 +40,6 @@ _MEAN_DECAY = 0.995
 # What is tried for the weighing.
 _LOOKAHEADS = (0.0, 0.25, 0.5, 1.0)
 _METRES_WEIGHTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
-_MEASURED = ("detection_rate", "e_add_mm", "distance_m")
 # Variance over a state's views, in objects squared, that counts as none.
 _VARIANCE_FLOOR = 0.1
 
@@ -193,7 +191,7 @@ def settle(path: Path, validation: BankLookup, starts: np.ndarray, steps: int) -
     network = load_network(path, validation.model.name)
     provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
     network.weighing = choose_weighing(network, validation, starts, steps)
-    settled = dict(zip(_MEASURED, validate(network, validation, starts, steps), strict=True))
+    settled = dict(zip(MEASURES, validate(network, validation, starts, steps), strict=True))
     save_network(network, path, validation.model.name, {**provenance, "settled": settled})
 
 
@@ -270,7 +268,7 @@ def roll_out(
 
 def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
     """(E, v) views to (E, v + moves): each next one is the view at 60 degrees farthest from all taken ones, the nearest
-    of equals. Of the rules that need nothing but geometry this finds most objects."""
+    of equals. It needs nothing but geometry, and can go on from any views."""
     arcs = sphere.arc(sphere.positions[:, None], sphere.positions)
     elevation = np.arcsin(sphere.positions[:, 2] / sphere.radius)
     ring = np.flatnonzero(np.isclose(elevation, elevation[np.abs(elevation - np.pi / 3).argmin()]))
@@ -326,10 +324,10 @@ class _Learner:
 
     def restore(self, path: Path) -> tuple[tuple[float, float], float]:
         """Take the weights of an earlier training; the best so far and the seconds spent."""
-        known = load_network(path, self.lookup.model.name)
+        stored = load_network(path, self.lookup.model.name)
         for network in (self._trained, self.network):
-            network.load_state_dict(known.state_dict())
-        self.network.weighing = known.weighing
+            network.load_state_dict(stored.state_dict())
+        self.network.weighing = stored.weighing
         provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
         progress = provenance["progress"]
         self.round, self.states = progress["round"], progress["states"]
@@ -384,13 +382,11 @@ class _Learner:
         some = self.rng.permutation(len(self.lookup.sphere))[: self.parameters.views]
         state["views"] = state["views"][some]
         nows, laters = self._trained.explain(state)
-        now, later = (
-            _labels([getattr(each, name) for each in drawn], some, nows.shape[2]) for name in ("now", "later")
-        )
+        now = _labels([example.now for example in drawn], some, nows.shape[2])
+        later = _labels([example.later for example in drawn], some, nows.shape[2])
         # What comes first is learned by itself, too: it is surer than the sum, which decides.
-        loss = _loss(nows, now, self.parameters.object_weight) + _loss(
-            nows + laters, now + later, self.parameters.object_weight
-        )
+        weight = self.parameters.object_weight
+        loss = _loss(nows, now, weight) + _loss(nows + laters, now + later, weight)
         self.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self._trained.parameters(), 1.0)
@@ -416,13 +412,13 @@ def _loss(predicted: torch.Tensor, truth: np.ndarray, object_weight: float) -> t
     """Square error of (B, M, n + 1, 2) gains where they are known: of their sums over the objects, of which the
     differences between the views of a state count most, and of each object's."""
     target = torch.from_numpy(truth)
-    known = torch.isfinite(target[:, :, -1:, :1])
-    off = torch.where(known, predicted - torch.nan_to_num(target), 0.0)
-    count = known.sum(dim=1, keepdim=True).clamp(min=1)
+    labelled = torch.isfinite(target[:, :, -1:, :1])
+    off = torch.where(labelled, predicted - torch.nan_to_num(target), 0.0)
+    count = labelled.sum(dim=1, keepdim=True).clamp(min=1)
     weight = _weigh_states(truth)[:, None, None]
     total = off.sum(dim=2, keepdim=True)
     level = total.sum(dim=1, keepdim=True) / count
-    about = torch.where(known, total - level, 0.0) ** 2 / count * weight[..., None]
+    about = torch.where(labelled, total - level, 0.0) ** 2 / count * weight[..., None]
     own = off**2 / count * weight[..., None]
     return (about.sum() + object_weight * own.sum()) / len(truth) + 0.25 * (level[:, 0, 0] ** 2 * weight[:, 0]).mean()
 
