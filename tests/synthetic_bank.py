@@ -8,17 +8,19 @@ from scipy.spatial.transform import Rotation
 from active6d_agent.bank import BankScene, SceneBank, world_poses
 from active6d_agent.baselines import line_of_sight
 from active6d_core.metrics import e_add
-from active6d_core.object_model import load_object
+from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.surface import SurfaceGrid, explainer
 
 
-def synthetic_scene(object_name: str, seed: int, objects: int, sphere: ViewSphere) -> BankScene:
-    """One scene of randomly placed objects."""
+def synthetic_scene(object_name: str, seed: int, objects: int, sphere: ViewSphere, noise: int = 0) -> BankScene:
+    """One scene of randomly placed objects; the same with other errors for another ``noise``."""
     model, rng = load_object(object_name), np.random.default_rng(seed)
     centres = rng.uniform(-0.15, 0.15, (objects, 3)) * [1, 1, 0.3] + [0, 0, 0.05]
     T_world_object = make_transform(Rotation.random(objects, rng=rng).as_matrix(), centres)
     sight = np.stack([line_of_sight(centres, i, sphere.positions, model.diameter) for i in range(objects)], axis=1)
+    rng = np.random.default_rng([seed, noise]) if noise else rng
     views, tables = [], []
     for view, position in enumerate(sphere.positions):
         seen = np.flatnonzero(sight[view] > 0.2)
@@ -34,15 +36,31 @@ def synthetic_scene(object_name: str, seed: int, objects: int, sphere: ViewSpher
     view, table = np.concatenate(views), np.concatenate(tables)
     errors = e_add(model, world_poses(table, view, sphere)[:, None], T_world_object, cutoff=0.05)
     errors[errors >= 0.05] = np.inf
-    name = f"{object_name}/synthetic/{seed}"
-    return BankScene(name, T_world_object, view, table, errors.astype(np.float32), rng.uniform(0, 2, len(sphere)))
+    return BankScene(
+        f"{object_name}/synthetic/{seed}",
+        T_world_object,
+        view,
+        table,
+        errors.astype(np.float32),
+        rng.uniform(0, 2, len(sphere)),
+        _shown_surface(model, T_world_object, sight > 0.1),
+    )
 
 
-def synthetic_bank(object_name: str = "mug", scenes: int = 2, objects: int = 8) -> SceneBank:
+def _shown_surface(model: ObjectModel, T_world_object: np.ndarray, is_seen: np.ndarray) -> np.ndarray:
+    """(M, b) packed bits: all cells that hold surface of the objects that a view sees, as (M, n) says."""
+    grid = SurfaceGrid.for_model(model)
+    near = explainer(model, 0.05).explains(grid.centres, T_world_object)
+    return np.packbits(is_seen.astype(np.uint8) @ near.astype(np.uint8) > 0, axis=1)
+
+
+def synthetic_bank(object_name: str = "mug", scenes: int = 2, objects: int = 8, noise: int = 0) -> SceneBank:
     """A bank of such scenes."""
     sphere = ViewSphere()
-    made = [synthetic_scene(object_name, seed, objects, sphere) for seed in range(scenes)]
-    return SceneBank(object_name, sphere, made, {"estimator": "synthetic"})
+    made = [synthetic_scene(object_name, seed, objects, sphere, noise) for seed in range(scenes)]
+    return SceneBank(
+        object_name, sphere, SurfaceGrid.for_model(load_object(object_name)), made, {"estimator": "synthetic"}
+    )
 
 
 def observe_synthetic(name: str, log: str) -> BankScene:

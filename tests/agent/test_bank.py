@@ -9,19 +9,21 @@ import pytest
 from synthetic_bank import observe_synthetic, synthetic_bank, synthetic_scene
 
 from active6d_agent.bank import BankScene, build_bank, load_bank, observe_scene, view_entropy
-from active6d_core.camera import DEFAULT_CAMERA, View
+from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.surface import SurfaceGrid
 
 SPHERE = ViewSphere()
+GRID = SurfaceGrid.for_model(load_object("mug"))
 
 
 def assert_equal(a: BankScene, b: BankScene):
     assert a.name == b.name
-    for name in ("T_world_object", "view", "table", "errors", "entropy"):
+    for name in ("T_world_object", "view", "table", "errors", "entropy", "surface"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
@@ -87,13 +89,13 @@ class ConstantVerifier:
 def test_observing_a_scene_pairs_hypotheses_with_the_truth():
     model = load_object("mug")
     truth = synthetic_scene("mug", 0, 3, SPHERE).T_world_object
-    stamps = []
+    stamps, camera = [], PinholeCamera.from_field_of_view(6, 4, 60.0)
 
     def capture(T_world_camera, stamp):
         stamps.append(stamp)
-        return View(stamp, np.zeros((4, 6, 3), np.uint8), np.full((4, 6), 0.7), DEFAULT_CAMERA, T_world_camera)
+        return View(stamp, np.zeros((4, 6, 3), np.uint8), np.full((4, 6), 0.7), camera, T_world_camera)
 
-    scene = observe_scene("mug/x/0", truth, capture, PerfectEstimator(truth), ConstantVerifier(), model, SPHERE)
+    scene = observe_scene("mug/x/0", truth, capture, PerfectEstimator(truth), ConstantVerifier(), model, SPHERE, GRID)
     assert stamps == [(i + 1) * 1_000_000_000 for i in range(100)]
     np.testing.assert_array_equal(scene.view, np.repeat(np.arange(100), 3))
     own = scene.errors[np.arange(300), np.tile(np.arange(3), 100)]

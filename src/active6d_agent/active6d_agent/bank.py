@@ -3,7 +3,8 @@
 The agent trains and is evaluated on look-ups in a bank, which is thousands of times faster than rendering. A bank is
 one compressed ``.npz`` per object and split, without pickled data: hypotheses as tables, in the camera's frame and in
 float32 as the graph's messages carry them; the true poses; the e_ADD of every hypothesis against every object that it
-is within 50 mm of (all that scoring needs); and each view's entropy.
+is within 50 mm of (all that scoring needs); each view's entropy; and the surface that each view's depth image shows, as
+one bit a cell of a grid over the bin.
 """
 
 import json
@@ -11,7 +12,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -24,9 +25,10 @@ from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimator import Estimator
+from active6d_perception.surface import SurfaceGrid
 from active6d_perception.verification import Verifier
 
-FORMAT = 1
+FORMAT = 2
 SHIPPED_BANKS = Path(__file__).parent / "banks"
 _HYPOTHESIS_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw", "verification", "score", "x0", "y0", "x1", "y1", "depth")
 
@@ -43,6 +45,7 @@ class BankScene:
             estimator's score, box (4), depth.
         errors: (H, n) float32 e_ADD in metres, ``inf`` from 50 mm on.
         entropy: (M,) entropy of each view's masks, nats.
+        surface: (M, ceil(cells / 8)) uint8, packed bits: the cells of the bank's grid that each view shows surface in.
 
     Raises:
         ValueError: shapes disagree, or a number is not finite.
@@ -54,6 +57,7 @@ class BankScene:
     table: np.ndarray
     errors: np.ndarray
     entropy: np.ndarray
+    surface: np.ndarray
 
     def __post_init__(self) -> None:
         H, n = len(self.view), len(self.T_world_object)
@@ -77,6 +81,7 @@ def observe_scene(
     verifier: Verifier,
     model: ObjectModel,
     sphere: ViewSphere,
+    grid: SurfaceGrid,
 ) -> BankScene:
     """Look at a scene from every view of the grid.
 
@@ -87,9 +92,10 @@ def observe_scene(
         estimator: the deployed one.
         verifier: the deployed one.
         model: the object.
-        sphere: the grid.
+        sphere: the views.
+        grid: of the surface.
     """
-    views, tables, entropy = [], [], []
+    views, tables, entropy, surface = [], [], [], []
     for index, position in enumerate(sphere.positions):
         view = capture(sphere.pose(position), (index + 1) * 1_000_000_000)
         hypotheses = estimator.estimate(view)
@@ -106,10 +112,11 @@ def observe_scene(
         tables.append(np.column_stack(rows).astype(np.float32))
         views.append(np.full(len(hypotheses), index))
         entropy.append(view_entropy(hypotheses.segmentation))
+        surface.append(np.packbits(grid.observe(view.depth, view.camera, view.T_world_camera)))
     view, table = np.concatenate(views), np.concatenate(tables)
     errors = e_add(model, world_poses(table, view, sphere)[:, None], T_world_object[None], cutoff=MISSED_E_ADD)
     errors[errors >= MISSED_E_ADD] = np.inf
-    return BankScene(name, T_world_object, view, table, errors.astype(np.float32), np.array(entropy))
+    return BankScene(name, T_world_object, view, table, errors.astype(np.float32), np.array(entropy), np.stack(surface))
 
 
 def view_entropy(segmentation: np.ndarray) -> float:
@@ -133,6 +140,7 @@ def build_bank(
     workers: int = 1,
     provenance: dict | None = None,
     sphere: ViewSphere | None = None,
+    grid: SurfaceGrid | None = None,
 ) -> Iterator[str]:
     """Observe all scenes and write the bank; yields each scene's name as it is done.
 
@@ -147,43 +155,41 @@ def build_bank(
         workers: processes.
         provenance: what the bank depends on and remembers: estimator, its parameters, noise, versions; JSON values.
         sphere: grid of the views, the default one when None.
+        grid: of the surface, the object's usual one when None.
     """
-    sphere, provenance = sphere or ViewSphere(), provenance or {}
-    known = _scenes_of(path, provenance)
+    grid = grid or SurfaceGrid.for_model(load_object(object_name))
+    empty = SceneBank(object_name, sphere or ViewSphere(), grid, [], provenance or {})
+    known = _scenes_of(path, empty)
     parts = path.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
     files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes if name not in known}
-    missing = [name for name, file in files.items() if not _scenes_of(file, provenance)]
+    missing = [name for name, file in files.items() if not _scenes_of(file, empty)]
     yield from (name for name in scenes if name not in missing)
     # Spawned, because a forked child inherits locks of threads that do not live on in it (Embree, BLAS).
     pool = ProcessPoolExecutor(max(1, min(workers, len(missing))), mp_context=multiprocessing.get_context("spawn"))
     try:
-        running = {
-            pool.submit(
-                _observe_to_file, observe, name, files[name], SceneBank(object_name, sphere, [], provenance)
-            ): name
-            for name in missing
-        }
+        running = {pool.submit(_observe_to_file, observe, name, files[name], empty): name for name in missing}
         for done in as_completed(running):
             done.result()
             yield running[done]
     finally:
         pool.shutdown(cancel_futures=True)
     made = known | {name: load_bank(file).scenes[0] for name, file in files.items()}
-    SceneBank(object_name, sphere, [made[name] for name in scenes], provenance).save(path)
+    replace(empty, scenes=[made[name] for name in scenes]).save(path)
     for file in files.values():
         file.unlink()
     if not any(parts.iterdir()):
         parts.rmdir()
 
 
-def _scenes_of(path: Path, provenance: dict) -> dict[str, BankScene]:
-    """The scenes of a bank that is whole and was made the same way, by name; none otherwise."""
+def _scenes_of(path: Path, like: "SceneBank") -> dict[str, BankScene]:
+    """The scenes of a bank that is whole and was made the same way as ``like``, by name; none otherwise."""
     try:
         bank = load_bank(path)
     except ValueError:
         return {}
-    same = bank.provenance == json.loads(json.dumps(provenance))
+    made = bank.provenance, bank.sphere, bank.grid
+    same = made == (json.loads(json.dumps(like.provenance)), like.sphere, like.grid)
     return {scene.name: scene for scene in bank.scenes} if same else {}
 
 
@@ -198,14 +204,25 @@ class SceneBank:
     Attributes:
         object_name: of the object.
         sphere: grid of the views.
+        grid: of the surface.
         scenes: in order.
         provenance: how the bank was made.
+
+    Raises:
+        ValueError: a scene's surface is not of this grid and these views.
     """
 
     object_name: str
     sphere: ViewSphere
+    grid: SurfaceGrid
     scenes: Sequence[BankScene]
     provenance: dict
+
+    def __post_init__(self) -> None:
+        expected = len(self.sphere), -(-len(self.grid) // 8)
+        for scene in self.scenes:
+            if scene.surface.shape != expected or scene.surface.dtype != np.uint8:
+                raise ValueError(f"{scene.name}: surface has shape {scene.surface.shape}, expected {expected} bytes")
 
     @cached_property
     def model(self) -> ObjectModel:
@@ -221,6 +238,7 @@ class SceneBank:
             "radius": self.sphere.radius,
             "elevations_degrees": list(self.sphere.elevations_degrees),
             "azimuths": self.sphere.azimuths,
+            "surface": asdict(self.grid),
             "provenance": self.provenance,
         }
         pairs = [np.nonzero(np.isfinite(scene.errors)) for scene in self.scenes]
@@ -238,6 +256,9 @@ class SceneBank:
                 pair_object=np.concatenate([columns for _, columns in pairs]).astype(np.int16),
                 pair_error=np.concatenate([s.errors[pair] for s, pair in zip(self.scenes, pairs, strict=True)]),
                 entropy=[scene.entropy for scene in self.scenes],
+                # View by view for each cell: a cell is mostly seen from many neighbouring views or from none, which
+                # compresses to a fraction of what cell by cell for each view does.
+                surface=[_transpose_bits(scene.surface, len(self.grid)) for scene in self.scenes],
             )
         unfinished.replace(path)
 
@@ -282,8 +303,10 @@ def load_bank(path: Path) -> SceneBank:
         if header["format"] != FORMAT:
             raise ValueError(f"format {header['format']}, this version reads {FORMAT}")
         sphere = ViewSphere(header["radius"], tuple(header["elevations_degrees"]), header["azimuths"])
+        surface = header["surface"]
+        grid = SurfaceGrid(**{**surface, "width": tuple(surface["width"])})
         scenes = [_read_scene(data, index, name) for index, name in enumerate(header["scenes"])]
-        return SceneBank(header["object"], sphere, scenes, header["provenance"])
+        return SceneBank(header["object"], sphere, grid, scenes, header["provenance"])
     except Exception as error:  # numpy raises many kinds on damaged archives
         raise ValueError(f"{path}: not a scene bank ({error}); make it with 'active6d bank'") from error
 
@@ -301,7 +324,20 @@ def _read_scene(data: dict[str, np.ndarray], index: int, name: str) -> BankScene
     errors = np.full((rows.stop - rows.start, objects.stop - objects.start), np.inf, np.float32)
     errors[data["pair_hypothesis"][pairs], data["pair_object"][pairs]] = data["pair_error"][pairs]
     view = np.repeat(np.arange(per_view.shape[1]), per_view[index])
-    return BankScene(name, data["T_world_object"][objects], view, data["table"][rows], errors, data["entropy"][index])
+    return BankScene(
+        name,
+        data["T_world_object"][objects],
+        view,
+        data["table"][rows],
+        errors,
+        data["entropy"][index],
+        _transpose_bits(data["surface"][index], per_view.shape[1]),
+    )
+
+
+def _transpose_bits(packed: np.ndarray, count: int) -> np.ndarray:
+    """(a, ceil(count / 8)) uint8, rows of packed bits, to (count, ceil(a / 8))."""
+    return np.packbits(np.unpackbits(packed, axis=1, count=count).T, axis=1)
 
 
 def world_poses(table: np.ndarray, view: np.ndarray, sphere: ViewSphere) -> np.ndarray:

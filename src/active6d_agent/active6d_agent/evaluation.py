@@ -111,12 +111,16 @@ def observe(
     allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
     count = (views >= 0).sum(axis=1)
     current = views[np.arange(len(views)), count - 1]
-    described = lookup.describe(lookup.fuse(scene, views, current), scene, current)
+    fused = lookup.fuse(scene, views, current)
+    described = zip(lookup.describe(fused, scene, current), lookup.unexplained(fused, scene, views), strict=True)
     observations = []
-    for objects, taken, number, moves in zip(described, views, count, left, strict=True):
+    for (objects, unexplained), taken, number, moves in zip(described, views, count, left, strict=True):
         positions = lookup.sphere.positions[taken[:number]]
         metres_left = metres - lookup.sphere.path_length(positions)
-        observations.append(Observation(objects, positions, lookup.sphere, allowed, int(moves), metres_left))
+        observation = Observation(
+            objects, positions, lookup.sphere, allowed, int(moves), metres_left, unexplained=unexplained
+        )
+        observations.append(observation)
     return observations
 
 
@@ -205,6 +209,16 @@ class Intervals:
     def of(self, values: np.ndarray) -> dict[str, list[float]]:
         """Both intervals of the mean of (E,) values, by name."""
         return {kind: np.quantile(weight @ values, [0.025, 0.975]).tolist() for kind, weight in self._weights.items()}
+
+    def of_ratio(self, part: np.ndarray, whole: np.ndarray) -> dict[str, list[float]]:
+        """Both intervals of the mean of (E,) ``part`` over that of (E,) ``whole``, of which some must be positive;
+        resamples without any are left out."""
+        table = {}
+        for kind, weight in self._weights.items():
+            wholes = weight @ whole
+            some = wholes > 0
+            table[kind] = np.quantile((weight @ part)[some] / wholes[some], [0.025, 0.975]).tolist()
+        return table
 
 
 def evaluate(

@@ -2,7 +2,8 @@
 
 Everything that does not depend on the chosen views is computed once: distances between hypotheses, their components,
 their boxes in every view. Clustering and suppression are those of :mod:`active6d_perception.clustering`, which the
-fusion node calls, so results are those of :class:`~active6d_perception.fusion.SceneFusion` for the same views.
+fusion node calls, so results are those of :class:`~active6d_perception.fusion.SceneFusion` for the same views. What of
+the surface each hypothesis explains is kept once it was asked for, see :mod:`active6d_perception.surface`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,7 @@ from active6d_core.se3 import invert
 from active6d_perception.clustering import cluster_groups, suppress_neighbours
 from active6d_perception.fusion import FusionParameters, evidence, preference, project_features
 from active6d_perception.model_views import model_views
+from active6d_perception.surface import explainer
 from active6d_perception.symmetric_distance import SymmetricDistance
 
 _NO_ROW = np.iinfo(np.int64).max
@@ -82,6 +84,7 @@ class BankLookup:
         self._index_distances(poses)
         self._projected = np.zeros((len(self.sphere), len(table), 5), np.float32)
         self._is_projected = np.zeros((len(self.sphere), len(bank.scenes)), bool)
+        self._index_surface()
 
     def _sort(self, scene: BankScene) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         T = world_poses(scene.table, scene.view, self.sphere)
@@ -230,6 +233,38 @@ class BankLookup:
         """:meth:`describe` one scene after ``views``, the last of them current."""
         scenes, current = np.array([scene]), np.array([views[-1]])
         return self.describe(self.fuse(scenes, np.array([views]), current), scenes, current)[0]
+
+    def _index_surface(self) -> None:
+        """Of each scene, only the cells that some view of the grid shows are kept."""
+        self._explainer = explainer(self.model, self.parameters.explained_within)
+        self._shown, self._surface = [], []
+        for scene in self.bank.scenes:
+            bits = np.unpackbits(scene.surface, axis=1, count=len(self.bank.grid))
+            cells = np.flatnonzero(bits.any(axis=0))
+            self._shown.append(self.bank.grid.centres[cells])
+            self._surface.append(np.packbits(bits[:, cells], axis=1))
+        # Zeros cost no memory until they are written to.
+        self._explained = np.zeros((len(self.view), max(surface.shape[1] for surface in self._surface)), np.uint8)
+        self._is_explained = np.zeros(len(self.view), bool)
+
+    def unexplained(self, fused: FusedBatch, scene: np.ndarray, views: np.ndarray) -> list[np.ndarray]:
+        """(k, 3) centres of the cells that any of each episode's (E, v) views, -1 padding, shows and that none of its
+        accumulated objects explains, as the fusion node publishes them."""
+        return [
+            self._unexplained(index, rows[rows >= 0], taken[taken >= 0])
+            for index, rows, taken in zip(scene.tolist(), fused.objects, views, strict=True)
+        ]
+
+    def _unexplained(self, scene: int, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
+        shown, surface = self._shown[scene], self._surface[scene]
+        new = rows[~self._is_explained[rows]]
+        if len(new):
+            explained = self._explainer.explains(shown, self.T_world_object[new])
+            self._explained[new, : surface.shape[1]] = np.packbits(explained, axis=1)
+            self._is_explained[new] = True
+        explained = np.bitwise_or.reduce(self._explained[rows, : surface.shape[1]], axis=0)
+        left = np.bitwise_or.reduce(surface[views], axis=0) & ~explained
+        return shown[np.unpackbits(left, count=len(shown)).view(bool)]
 
     def object_errors(self, fused: FusedBatch) -> np.ndarray:
         """(E, o) e_ADD of each true object's best accumulated hypothesis, metres, at most 50 mm."""

@@ -1,11 +1,11 @@
 """What a policy sees, what it decides, and how policies are found by name.
 
-A policy needs nothing that a robot does not have: the fused objects, where the camera has been, which views it may
-take, and what is left of its budget (paper, "Problem definition"). The node, the environment and the evaluation all
-speak to policies through this module.
+A policy needs nothing that a robot does not have: the fused objects and the surface that is of none of them, where the
+camera has been, which views it may take, and what is left of its budget (paper, "Problem definition"). The node, the
+environment and the evaluation all speak to policies through this module.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,6 +33,8 @@ class Observation:
         allowed: (M,) bool, views of the grid that the camera can reach.
         steps_left: moves left, at least 1.
         metres_left: arc left on the sphere, ``inf`` without such a budget.
+        unexplained: (k, 3) places of the surface that depth images have shown and that is of none of the objects,
+            metres in the world.
     """
 
     objects: SceneObjects
@@ -41,6 +43,7 @@ class Observation:
     allowed: np.ndarray
     steps_left: int
     metres_left: float = np.inf
+    unexplained: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def steps(self) -> int:

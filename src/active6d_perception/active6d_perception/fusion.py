@@ -37,6 +37,8 @@ class FusionParameters:
             points. With these three a cluster is as good as its best hypothesis, so among many views one that is
             wrong and sure of itself prevails. ``evidence`` takes the hypothesis of the highest confidence, and the
             cluster whose squared confidences have the largest sum: views that agree outvote the one.
+        explained_within: surface at most this fraction of the diameter away from an object is that object's, see
+            :class:`~active6d_perception.surface.Explainer`.
 
     Raises:
         ValueError: a value is out of range.
@@ -46,6 +48,7 @@ class FusionParameters:
     exclusion: float = 0.2
     min_verification: float = -1.0
     rank_by: str = "evidence"
+    explained_within: float = 0.12
 
     def __post_init__(self) -> None:
         if not self.cut > 0:
@@ -54,6 +57,8 @@ class FusionParameters:
             raise ValueError(f"fusion: exclusion must not be negative, got {self.exclusion}")
         if not -1 <= self.min_verification <= 1:
             raise ValueError(f"fusion: min_verification must be in [-1, 1], got {self.min_verification}")
+        if not 0 < self.explained_within <= 1:
+            raise ValueError(f"fusion: explained_within must be in (0, 1], got {self.explained_within}")
         if self.rank_by not in RANKINGS:
             raise ValueError(f"fusion: rank_by must be one of {', '.join(RANKINGS)}, got {self.rank_by!r}")
 

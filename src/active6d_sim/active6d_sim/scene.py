@@ -32,13 +32,8 @@ class Bin:
 
     @classmethod
     def for_model(cls, model: ObjectModel) -> "Bin":
-        """The square bin in which the model's usual number of instances lies one and a half to two layers deep.
-
-        Its side is 0.625 diameters times the root of that number: then objects hide each other, but the heap neither
-        towers nor leaves the default camera's picture (measured in `docs/scenes.md`).
-        """
-        width = round(0.625 * model.diameter * float(np.sqrt(np.mean(model.instances))), 2)
-        return cls(width, width, round(0.6 * model.diameter, 3))
+        """The square bin that the model's usual number of instances lies in, see ``ObjectModel.bin_width``."""
+        return cls(model.bin_width, model.bin_width, round(0.6 * model.diameter, 3))
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,6 +94,7 @@ def observe_scene_by_name(name: str, *, estimator: str, noise: float, seed: int)
     from active6d_core.object_model import load_object
     from active6d_core.view_sphere import ViewSphere
     from active6d_perception.estimator import create_estimator
+    from active6d_perception.surface import SurfaceGrid
     from active6d_perception.verification import Verifier
     from active6d_sim.scene_store import find_scene
     from active6d_sim.sensor import SensorNoise
@@ -111,6 +112,7 @@ def observe_scene_by_name(name: str, *, estimator: str, noise: float, seed: int)
         Verifier(model),
         model,
         ViewSphere(),
+        SurfaceGrid.for_model(model),
     )
 
 

@@ -1,0 +1,172 @@
+"""The surface that depth images have shown, and the part of it that no accumulated object explains.
+
+Objects that an estimator misses in every view taken are mostly seen in part: depth images show surface where there is
+no object yet, and a policy can look there again. Surface is kept as the cells of a grid over the inside of the bin, so
+that a view is a row of bits, a scene the union of its views, and a bank of views small.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+import open3d as o3d
+
+from active6d_core.camera import PinholeCamera, pixel_rays
+from active6d_core.object_model import ObjectModel
+
+# Every second pixel each way is looked at; a cell counts as seen with this many of them in it.
+_STRIDE = 2
+_LEAST_POINTS = 3
+# Edge of a voxel of the distance field, in diameters.
+_VOXEL = 1 / 48
+
+
+@dataclass(frozen=True)
+class SurfaceGrid:
+    """Axis-aligned cells over the workspace: a box centred above the world's origin.
+
+    Cells are numbered ``(ix * ny + iy) * nz + iz``, each index rising along its axis.
+
+    Attributes:
+        width: of the box along world x and y, metres; walls should be outside.
+        floor: lower end of the box along world z, metres; the bin's floor should be below.
+        height: upper end of the box along world z, metres.
+        cell: edge of a cell, metres.
+
+    Raises:
+        ValueError: a size is not finite, or there is no cell, or there are more than a million.
+    """
+
+    width: tuple[float, float]
+    floor: float
+    height: float
+    cell: float
+
+    def __post_init__(self) -> None:
+        sizes = (*self.width, self.floor, self.height, self.cell)
+        if len(self.width) != 2 or not np.isfinite(sizes).all() or not self.cell > 0:
+            raise ValueError(f"surface grid: sizes must be finite and the cell positive, got {self}")
+        if min(self.shape) < 1 or np.prod(self.shape, dtype=float) > 1e6:
+            raise ValueError(f"surface grid: {self} has {self.shape} cells, expected one to a million")
+
+    @classmethod
+    def for_model(cls, model: ObjectModel) -> "SurfaceGrid":
+        """The grid over the bin that an object's heap usually lies in; margins keep the sensor's noise on walls and
+        floor out (measured in `docs/perception.md`)."""
+        width = model.bin_width - 0.16 * model.diameter
+        return cls((width, width), 0.08 * model.diameter, 1.5 * model.diameter, model.diameter / 12)
+
+    @cached_property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of cells along x, y and z."""
+        x, y, z = (int(size / self.cell + 1e-6) for size in (*self.width, self.height - self.floor))
+        return x, y, z
+
+    def __len__(self) -> int:
+        return int(np.prod(self.shape))
+
+    @cached_property
+    def low(self) -> np.ndarray:
+        """(3,) the corner that indices count from, metres in the world."""
+        return np.array([-0.5 * self.shape[0] * self.cell, -0.5 * self.shape[1] * self.cell, self.floor])
+
+    @cached_property
+    def centres(self) -> np.ndarray:
+        """(cells, 3) metres in the world."""
+        return self.low + (np.indices(self.shape).reshape(3, -1).T + 0.5) * self.cell
+
+    def observe(self, depth: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray) -> np.ndarray:
+        """The cells that a view shows surface in.
+
+        Args:
+            depth: (H, W) metres along z, NaN where invalid.
+            camera: intrinsics of ``depth``.
+            T_world_camera: (4, 4) pose of the optical frame.
+
+        Returns:
+            (cells,) bool.
+        """
+        z = depth[::_STRIDE, ::_STRIDE].ravel()
+        R, t = T_world_camera[:3, :3] / self.cell, (T_world_camera[:3, 3] - self.low) / self.cell
+        index = R.astype(np.float32) @ _rays(camera) * z + t.astype(np.float32)[:, None]
+        inside = np.ones(len(z), bool)
+        for along, count in zip(index, self.shape, strict=True):
+            inside &= (along >= 0) & (along < count)  # false for NaN
+        cells = np.ravel_multi_index(index[:, inside].astype(np.intp), self.shape)
+        return np.bincount(cells, minlength=len(self)) >= _LEAST_POINTS
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: PinholeCamera) -> np.ndarray:
+    """(3, n) rays with z = 1 through the pixels that are looked at."""
+    return np.ascontiguousarray(pixel_rays(camera)[::_STRIDE, ::_STRIDE].reshape(-1, 3).T)
+
+
+class Explainer:
+    """Says which points lie on the surface of which pose of an object, from a table of the surface's surroundings.
+
+    Args:
+        model: the object.
+        within: points at most this far from the surface are explained, in diameters; exact to a voxel's half diagonal,
+            2 % of the diameter.
+    """
+
+    def __init__(self, model: ObjectModel, within: float) -> None:
+        self._voxel = _VOXEL * model.diameter
+        reach = within * model.diameter
+        low, high = model.mesh.bounds + [[-reach - self._voxel], [reach + self._voxel]]
+        shape = np.ceil((high - low) / self._voxel).astype(int) + 1
+        self._low, self._shape = low, shape
+        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        mesh = model.mesh
+        scene.add_triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+        centres = low + (np.indices(shape).reshape(3, -1).T + 0.5) * self._voxel
+        near = scene.compute_distance(centres.astype(np.float32), nthreads=1).numpy().reshape(shape) <= reach
+        # What lies outside of the table is looked up in its outermost layer.
+        self._near = np.zeros(shape, bool)
+        self._near[1:-1, 1:-1, 1:-1] = near[1:-1, 1:-1, 1:-1]
+
+    def explains(self, points: np.ndarray, T_world_object: np.ndarray) -> np.ndarray:
+        """Whether each of (k, 3) points in the world is near the surface of each of (n, 4, 4) poses: (n, k) bool."""
+        R = np.swapaxes(T_world_object[:, :3, :3], 1, 2) / self._voxel
+        offset = -R @ T_world_object[:, :3, 3:] - self._low[:, None] / self._voxel
+        index = (R.reshape(-1, 3) @ points.T).reshape(len(R), 3, len(points))
+        index += offset
+        np.clip(index, 0, (self._shape - 1)[:, None], out=index)
+        x, y, z = np.moveaxis(index.astype(np.int32), 1, 0)
+        return self._near.ravel().take((x * self._shape[1] + y) * self._shape[2] + z)
+
+
+@lru_cache(maxsize=8)
+def explainer(model: ObjectModel, within: float) -> Explainer:
+    """The explainer of an object, made once per process."""
+    return Explainer(model, within)
+
+
+class SceneSurface:
+    """Accumulates what views show of the surface in the workspace, and says what of it no object explains.
+
+    Args:
+        model: the object.
+        grid: of the workspace.
+        within: see :class:`Explainer`.
+    """
+
+    def __init__(self, model: ObjectModel, grid: SurfaceGrid, within: float) -> None:
+        self.grid = grid
+        self._explainer = explainer(model, within)
+        self._seen: dict[int, np.ndarray] = {}
+
+    def add_view(self, stamp: int, seen: np.ndarray) -> None:
+        """Take in the (cells,) bool that the view of a stamp (ns) shows; once more changes nothing."""
+        self._seen[stamp] = seen
+
+    def forget_before(self, stamp: int) -> None:
+        """Forget the views older than ``stamp`` in nanoseconds."""
+        self._seen = {known: seen for known, seen in self._seen.items() if known >= stamp}
+
+    def unexplained(self, T_world_object: np.ndarray) -> np.ndarray:
+        """(k, 3) centres of the cells seen in any view and explained by none of (n, 4, 4) poses, metres."""
+        seen = np.logical_or.reduce([np.zeros(len(self.grid), bool), *self._seen.values()])
+        points = self.grid.centres[seen]
+        return points[~self._explainer.explains(points, T_world_object).any(axis=0)]
