@@ -268,25 +268,25 @@ def cached_banks() -> Path:
     return cache_folder("banks")
 
 
-def bank_path(folder: Path, object_name: str, split: str) -> Path:
-    """Where the bank of an object and split lies in a folder of banks."""
-    return folder / f"{object_name}_{split}.npz"
+def bank_path(folder: Path, object_name: str, split: str, seed: int = 0) -> Path:
+    """Where the bank of an object and split lies in a folder of banks; one of another seed of the noise lies beside."""
+    return folder / f"{object_name}_{split}{f'_seed{seed}' if seed else ''}.npz"
 
 
-def find_bank(object_name: str, split: str, folder: Path | None = None) -> Path:
-    """The bank of an object and split in ``folder``; without one, in the cache or else among the shipped ones.
+def find_bank(object_name: str, split: str, folder: Path | None = None, seed: int = 0) -> Path:
+    """The bank of an object, split and seed in ``folder``; without one, in the cache or else among the shipped ones.
 
     Raises:
         ValueError: there is none; the message says what makes it.
     """
     folders = (cached_banks(), SHIPPED_BANKS) if folder is None else (folder,)
-    for path in (bank_path(each, object_name, split) for each in folders):
+    for path in (bank_path(each, object_name, split, seed) for each in folders):
         if path.is_file():
             return path
-    into = "" if folder is None else f" --banks {folder}"
+    options = (f" --seed {seed}" if seed else "") + ("" if folder is None else f" --banks {folder}")
     raise ValueError(
-        f"there is no {split} bank of '{object_name}' in {folders[0]}; "
-        f"make it with: active6d bank --object {object_name} --split {split}{into}"
+        f"there is no {split} bank of '{object_name}'{f' with seed {seed}' if seed else ''} in {folders[0]}; "
+        f"make it with: active6d bank --object {object_name} --split {split}{options}"
     )
 
 

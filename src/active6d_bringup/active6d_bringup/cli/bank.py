@@ -31,7 +31,8 @@ def bank(
 ) -> None:
     """Look at every scene of a split from every view, and store what the estimator and verification said.
 
-    Goes on where it was interrupted. Policies are trained and evaluated on such banks.
+    Goes on where it was interrupted. Policies are trained and evaluated on such banks, those of seed 0; with another
+    --seed the sensor's noise falls differently, and the bank lies beside, for [bold]active6d ablate luck[/bold].
 
     Example: [bold]active6d bank --object mug --split test[/bold]
     """
@@ -46,7 +47,7 @@ def bank(
     if estimator == AUTOMATIC:
         estimator = choose_estimator(object_name)
     create_estimator(estimator, load_object(object_name))  # refuses a wrong name or missing weights before any process
-    path = bank_path(banks or cached_banks(), object_name, split)
+    path = bank_path(banks or cached_banks(), object_name, split, seed)
     observe = partial(observe_scene_by_name, estimator=estimator, noise=noise, seed=seed)
     provenance = _provenance(object_name, estimator, noise, seed)
     with progress_bar() as progress, single_threaded():
