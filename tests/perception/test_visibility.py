@@ -1,0 +1,89 @@
+"""Expected visibility against ray casting of the same meshes."""
+
+import numpy as np
+import open3d as o3d
+import pytest
+from scipy.spatial.transform import Rotation
+
+from active6d_core.object_model import load_object
+from active6d_core.se3 import make_transform
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.visibility import POINTS, expected_visibility
+
+NAMES = ("mug", "bunny", "coffee_cup")
+
+
+def cast(model, poses, eye, target, side=120):
+    """(side, side) index of the object that each pixel of a camera at ``eye`` shows, -1 for none, and what single
+    objects would fill."""
+
+    def look(some):
+        scene = o3d.t.geometry.RaycastingScene()
+        for T in some:
+            vertices = model.mesh.vertices @ T[:3, :3].T + T[:3, 3]
+            scene.add_triangles(vertices.astype(np.float32), np.asarray(model.mesh.faces, np.uint32))
+        rays = scene.create_rays_pinhole(25.0, target, eye, [0.0, 0.0, 1.0], side, side)
+        found = scene.cast_rays(rays)["geometry_ids"].numpy().astype(np.int64)
+        return np.where(found == scene.INVALID_ID, -1, found)
+
+    return look(poses), np.array([(look([T]) == 0).sum() for T in poses])
+
+
+def heap(model, rng, count):
+    """Poses close together, but not in each other."""
+    side = 0.8 * model.diameter
+    places = [(x, y, z) for z in range(2) for x in range(3) for y in range(2)][:count]
+    turns = Rotation.random(count, random_state=int(rng.integers(1 << 30))).as_matrix()
+    offsets = np.array(places) * side - [side, side / 2, 0.0] + rng.normal(0, 0.1 * side, (count, 3))
+    return np.stack([make_transform(*pair) for pair in zip(turns, offsets, strict=True)])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shares_are_those_of_a_rendering(name):
+    model, rng = load_object(name), np.random.default_rng(0)
+    expected, told = [], []
+    for _ in range(4):
+        T = heap(model, rng, 10)
+        eyes = ViewSphere().positions[rng.integers(100, size=5)]
+        told.append(expected_visibility(model).shares(T, eyes).T.ravel())
+        for eye in eyes:
+            shown, alone = cast(model, T, eye, T[:, :3, 3].mean(axis=0))
+            expected.append([(shown == index).sum() / alone[index] for index in range(len(T))])
+    expected, told = np.concatenate(expected), np.concatenate(told)
+    assert np.ptp(expected) > 0.9, "some are hidden and some are not"
+    assert np.abs(told - expected).mean() < 0.06
+    assert np.corrcoef(told, expected)[0, 1] > 0.96
+
+
+def test_an_object_alone_is_seen_whole_and_one_right_behind_another_is_not():
+    model = load_object("bunny")
+    low, high = make_transform(np.eye(3), np.zeros(3)), make_transform(np.eye(3), [0.0, 0.0, 0.2])
+    above, aside = np.array([[0.0, 0.0, 0.8], [0.8, 0.0, 0.1]])
+    shares = expected_visibility(model).shares(np.stack([low, high]), np.stack([above, aside]))
+    np.testing.assert_array_equal(shares[:, 1], 1.0)
+    assert shares[0, 0] == 0.0
+    assert shares[1, 0] == 1.0
+
+
+def test_a_patch_is_hidden_where_a_ray_to_it_is():
+    """Point by point, against rays through the same mesh."""
+    model, rng = load_object("mug"), np.random.default_rng(1)
+    T = heap(model, rng, 6)
+    patches = rng.uniform(-0.12, 0.12, (40, 1, 3)) - [0.0, 0.0, 0.12]
+    eyes = ViewSphere().positions[::7]
+    told = expected_visibility(model).shares(T, eyes, np.tile(patches, (1, POINTS, 1)))[len(T) :]
+    scene = o3d.t.geometry.RaycastingScene()
+    for pose in T:
+        vertices = model.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        scene.add_triangles(vertices.astype(np.float32), np.asarray(model.mesh.faces, np.uint32))
+    rays = np.concatenate(np.broadcast_arrays(patches, eyes - patches), axis=-1).astype(np.float32)
+    hidden = scene.test_occlusions(o3d.core.Tensor(rays)).numpy()
+    assert 0.2 < hidden.mean() < 0.8
+    assert ((told == 0.0) == hidden).mean() > 0.92
+
+
+def test_nothing_is_seen_of_nothing():
+    model, eyes = load_object("bunny"), ViewSphere().positions
+    shares = expected_visibility(model).shares(np.zeros((0, 4, 4)), eyes, np.zeros((2, POINTS, 3)))
+    np.testing.assert_array_equal(shares, np.ones((2, 100)))
+    assert expected_visibility(model).shares(np.zeros((0, 4, 4)), eyes).shape == (0, 100)
