@@ -48,7 +48,7 @@ class FusionParameters:
     exclusion: float = 0.2
     min_verification: float = -1.0
     rank_by: str = "evidence"
-    explained_within: float = 0.12
+    explained_within: float = 0.08
 
     def __post_init__(self) -> None:
         if not self.cut > 0:

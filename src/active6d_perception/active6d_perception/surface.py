@@ -53,8 +53,8 @@ class SurfaceGrid:
     def for_model(cls, model: ObjectModel) -> "SurfaceGrid":
         """The grid over the bin that an object's heap usually lies in; margins keep the sensor's noise on walls and
         floor out (measured in `docs/perception.md`)."""
-        width = model.bin_width - 0.16 * model.diameter
-        return cls((width, width), 0.08 * model.diameter, 1.5 * model.diameter, model.diameter / 12)
+        width = model.bin_width - 0.08 * model.diameter
+        return cls((width, width), 0.05 * model.diameter, 1.5 * model.diameter, model.diameter / 12)
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
