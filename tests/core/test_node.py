@@ -125,11 +125,14 @@ def test_latched_inputs_wait_for_activation(graph):
     assert [result.data for result in results] == [f"{value:.1f}" for value in (*range(5, 14), 14, 15)]
 
 
-def test_a_failing_setup_is_reported_with_its_reason(graph):
+def test_a_failing_setup_is_reported_once_with_its_reason(graph, capfd):
     node = graph.add(DepthNode(context=graph.context), start=False)
     node.fail_at_setup = True
     with pytest.raises(ValueError, match=r"missing\.ply"):
         node.start()
+    assert capfd.readouterr().err == ""
+    node.trigger_configure()  # what a lifecycle manager asks for over a service: it sees a refusal, the log says why
+    assert "setup failed: mesh missing.ply does not exist" in capfd.readouterr().err
 
 
 def test_a_node_that_fails_to_begin_stays_inactive(graph):

@@ -56,6 +56,7 @@ class GraphNode(LifecycleNode):
         parameters = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
         super().__init__(name, context=context, namespace=namespace, parameter_overrides=parameters)
         self._active = False
+        self._starting = False
         self._held: list[tuple[Callable[[Any], None], deque]] = []
         self._failure: Exception | None = None
         self._views_measured = 0
@@ -193,9 +194,13 @@ class GraphNode(LifecycleNode):
         Raises:
             Exception: what :meth:`setup` or :meth:`begin` raised.
         """
-        for transition in (self.trigger_configure, self.trigger_activate):
-            if transition() != TransitionCallbackReturn.SUCCESS:
-                raise self._failure or RuntimeError(f"{self.get_name()}: could not start")
+        self._starting = True
+        try:
+            for transition in (self.trigger_configure, self.trigger_activate):
+                if transition() != TransitionCallbackReturn.SUCCESS:
+                    raise self._failure or RuntimeError(f"{self.get_name()}: could not start")
+        finally:
+            self._starting = False
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run :meth:`setup`."""
@@ -246,7 +251,8 @@ class GraphNode(LifecycleNode):
         # Any failure must become a refused transition: rclpy would swallow the exception and lose its text.
         except Exception as error:
             self._failure = error
-            self.get_logger().error(f"{step.__name__} failed: {error}")
+            if not self._starting:  # who calls start() is told by the exception
+                self.get_logger().error(f"{step.__name__} failed: {error}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
