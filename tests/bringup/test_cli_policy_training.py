@@ -60,6 +60,7 @@ def test_what_is_trained_is_exported_and_evaluated(banks, tmp_path, name, length
         (["--policy", "random"], "--policy 'random' is not among view-attention, attention"),
         (["--banks", "/nowhere"], "active6d bank --object mug --split train --banks /nowhere"),
         (["--set", "training.magic=1"], "--set training.magic: known are steps"),
+        (["--set", "training.magic=1", "--banks", "/nowhere"], "--set training.magic: known are steps"),
         (["--set", "reward.alpha=1"], "--set reward: known are training, weighing"),
         (["--policy", "attention", "--set", "reward.alpha=3"], "alpha and beta must be in [0, 1]"),
         (["--set", "weighing.lookahead=2"], "lookahead is 2"),

@@ -1,7 +1,7 @@
 """``active6d train policy``: from scene banks to a deployable policy."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,8 +22,8 @@ from active6d_bringup.cli.output import (
 if TYPE_CHECKING:
     from active6d_agent.lookup import BankLookup
 
-#: Of a training as it goes on, and how many steps or rounds it has in all.
-_Curve = tuple[Iterator[Any], int]
+#: Look-ups of the train and val banks to a training as it goes on, and how many steps or rounds it has in all.
+_Training = tuple[Callable[["BankLookup", "BankLookup"], Iterator[Any]], int]
 LEARNED = ("view-attention", "attention")
 _OUT = "Folder of the training; by default active6d/policies/OBJECT/POLICY in the cache folder."
 _LENGTH = "Rounds of view-attention, environment steps of attention; its own default."
@@ -61,13 +61,13 @@ def policy(
     if name not in LEARNED:
         raise ValueError(f"--policy '{name}' is not among {', '.join(LEARNED)}")
     groups = parse_overrides(override or [])
-    paths = [find_bank(object_name, split, banks) for split in ("train", "val")]
     folder = out or cache_folder("policies") / object_name / name
+    make = _imitation if name == "view-attention" else _ppo
+    start, total = make(folder, {"steps": steps, "seed": seed}, length, groups, resume)
+    paths = [find_bank(object_name, split, banks) for split in ("train", "val")]
     with messages.status("reading the banks"):
         lookups = [BankLookup(load_bank(path)) for path in paths]
-    make = _imitation if name == "view-attention" else _ppo
-    curve, total = make(lookups, folder, {"steps": steps, "seed": seed}, length, groups, resume)
-    _follow(curve, total, folder, f"{name}, {object_name}")
+    _follow(start(*lookups), total, folder, f"{name}, {object_name}")
     best = folder / "best.safetensors"
     if export is not None:
         export_weights(best, export, f"{name}_{object_name}")
@@ -77,9 +77,7 @@ def policy(
     )
 
 
-def _imitation(
-    banks: list["BankLookup"], folder: Path, common: dict, length: int | None, groups: dict, resume: bool
-) -> _Curve:
+def _imitation(folder: Path, common: dict, length: int | None, groups: dict, resume: bool) -> _Training:
     from active6d_agent.imitation import ImitationParameters, imitate
     from active6d_agent.view_attention import Weighing
 
@@ -87,12 +85,10 @@ def _imitation(
     parameters = _make(ImitationParameters, "training", {**common, **own}, groups)
     weighing = _make(Weighing, "weighing", {}, groups)
     _refuse_others(groups, ("training", "weighing"))
-    return imitate(*banks, folder, parameters, weighing, resume=resume), parameters.rounds
+    return lambda train, val: imitate(train, val, folder, parameters, weighing, resume=resume), parameters.rounds
 
 
-def _ppo(
-    banks: list["BankLookup"], folder: Path, common: dict, length: int | None, groups: dict, resume: bool
-) -> _Curve:
+def _ppo(folder: Path, common: dict, length: int | None, groups: dict, resume: bool) -> _Training:
     from active6d_agent.environment import RewardParameters
     from active6d_agent.train import TrainingParameters, train_policy
 
@@ -104,7 +100,7 @@ def _ppo(
     parameters = _make(TrainingParameters, "training", {**common, **own}, groups)
     reward = _make(RewardParameters, "reward", {}, groups)
     _refuse_others(groups, ("training", "reward"))
-    return train_policy(*banks, folder, parameters, reward, resume=resume), parameters.total
+    return lambda train, val: train_policy(train, val, folder, parameters, reward, resume=resume), parameters.total
 
 
 def _make(kind: type, group: str, own: dict, groups: dict[str, dict]) -> Any:
