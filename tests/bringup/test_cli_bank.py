@@ -129,7 +129,7 @@ def untrained(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("part", ["steps", "fusion", "verification", "attention", "signs"])
+@pytest.mark.parametrize("part", ["steps", "fusion", "verification", "luck", "attention", "signs"])
 def test_ablations_give_numbers_and_a_figure(banks, tmp_path, part, monkeypatch):
     monkeypatch.setattr("active6d_agent.ablation.STEPS", (0, 2))
     file, png = tmp_path / "x.json", tmp_path / "x.png"
@@ -141,6 +141,10 @@ def test_ablations_give_numbers_and_a_figure(banks, tmp_path, part, monkeypatch)
         "steps": ["random", "random"],
         "fusion": ["clustering and exclusion", "clustering alone", "no clustering"],
         "verification": list(RANKINGS),
+        "luck": [
+            *("random, own noise", "random, other noise"),
+            *(f"oracle, {noise} noise" for noise in ("own", "unforeseen", "other")),
+        ],
         "attention": ["learned", "lowest-score"],
         "signs": ["turned round", "as printed"],
     }
@@ -167,6 +171,15 @@ def test_planning_trades_metres_and_moves(banks, tmp_path, untrained, monkeypatc
     against = json.loads(file.read_text())["policies"]["view-attention"]["against"]["random"]
     assert f"{against['detection_rate']['mean']:+.3f}" in result.stdout
     assert rows["random"]["against_first"]["e_add_mm"]["mean"] == pytest.approx(-against["e_add_mm"]["mean"])
+
+
+def test_luck_needs_a_second_bank(banks, tmp_path):
+    from shutil import copy
+
+    copy(bank_path(banks, "mug", "test"), tmp_path)
+    result = run("ablate", "luck", "--banks", str(tmp_path))
+    assert result.exit_code == 2
+    assert f"active6d bank --object mug --split test --seed 1 --banks {tmp_path}" in result.stderr
 
 
 def test_seeds_are_told_apart_on_validation_scenes(banks, tmp_path, untrained, monkeypatch):

@@ -25,10 +25,13 @@ class Part(StrEnum):
     FUSION = "fusion"
     SIGNS = "signs"
     PLANNING = "planning"
+    LUCK = "luck"
     SEEDS = "seeds"
 
 
 _TRAINED = (Part.ALPHA, Part.ATTENTION, Part.SIGNS)
+#: Seed of the noise in the second bank of ``luck``.
+_AGAIN = 1
 #: Trainings of each learned policy that ``seeds`` compares.
 _SEEDS = 3
 _OUT = "Folder of the trainings; the cache's."
@@ -38,15 +41,16 @@ def ablate(
     part: Annotated[Part, typer.Argument(help="What is varied or left out.")],
     object_name: ObjectName = "mug",
     policies: Annotated[
-        str, typer.Option(help="Whose views: several for steps, the first of them for verification and fusion.")
-    ] = "random,max-distance,lowest-score",
+        str, typer.Option(help="Whose views: several for steps and luck, the first for verification and fusion.")
+    ] = "random,max-distance,unidirectional,lowest-score",
     steps: Annotated[int, typer.Option(min=1, help="Budget of moves T, where it is not varied.")] = 5,
     length: Annotated[
         int, typer.Option(min=1, help="Environment steps of each training (alpha, attention, signs).")
     ] = 200_000,
     sample: Sample = 200,
     override: Annotated[
-        list[str] | None, typer.Option("--set", metavar="POLICY.NAME=VALUE", help="For steps and planning; repeatable.")
+        list[str] | None,
+        typer.Option("--set", metavar="POLICY.NAME=VALUE", help="For steps, planning and luck; repeatable."),
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help=_OUT)] = None,
     png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the figure into this PNG.")] = None,
@@ -59,6 +63,7 @@ def ablate(
     alpha: the weight of getting closer in the reward. steps: the number of moves. attention: the learned one against
     the lowest score. verification: its score against the estimator's. fusion: with clustering and without. signs: the
     reward's, turned round and as the paper prints them. planning: what the default policy weighs, without training.
+    luck: the same views with other noise of the sensor, from a second bank (active6d bank --split test --seed 1).
     seeds: three trainings of both learned policies, made where they are missing.
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
@@ -72,6 +77,8 @@ def ablate(
     splits = {Part.SEEDS: ("val", "test"), **dict.fromkeys(_TRAINED, ("train", "val", "test"))}.get(part, ("test",))
     paths = {split: find_bank(object_name, split, banks) for split in splits}
     parameters = parse_overrides(override or [])
+    if part is Part.LUCK:
+        paths["again"] = find_bank(object_name, "test", banks, _AGAIN)
     if part is Part.SEEDS:
         weights = _train_seeds(object_name, out, steps, banks)
     with messages.status("reading the banks"):
@@ -84,6 +91,8 @@ def ablate(
         rows = _vary_steps(lookups["test"], names, starts, seed, parameters)
     elif part is Part.PLANNING:
         rows = _vary_planning(lookups["test"], starts, steps, seed, parameters)
+    elif part is Part.LUCK:
+        rows = _try_other_noise(lookups["test"], lookups["again"], names, starts, steps, seed, parameters)
     elif part is Part.SEEDS:
         rows = _compare_seeds(lookups, weights, starts, steps, sample, seed)
     else:
@@ -165,6 +174,28 @@ def _vary_planning(lookup: "BankLookup", starts: Any, steps: int, seed: int, par
     return rows
 
 
+def _try_other_noise(
+    lookup: "BankLookup",
+    again: "BankLookup",
+    names: list[str],
+    starts: Any,
+    steps: int,
+    seed: int,
+    parameters: dict[str, dict],
+) -> list[dict]:
+    from active6d_agent.luck import ablate_luck
+    from active6d_bringup.cli.evaluate import usable_policies
+
+    usable_policies(",".join(names), lookup.bank, parameters)
+    rows = []
+    with progress_bar() as bar:
+        task = bar.add_task("luck", total=len({*names, "random", "oracle"}))
+        for name, noise, row in ablate_luck((lookup, again), names, starts, steps, seed=seed, parameters=parameters):
+            rows.append({"variant": f"{name}, {noise} noise", "policy": name, "noise": noise, **row})
+            bar.update(task, completed=len({row["policy"] for row in rows}), description=rows[-1]["variant"])
+    return rows
+
+
 def _train_seeds(object_name: str, out: Path | None, steps: int, banks: Path | None) -> dict[tuple[str, int], Path]:
     """Weights of every learned policy and seed; trains, as ``active6d train policy`` does, those that are not there."""
     from active6d_agent.bank import cached_banks
@@ -233,7 +264,7 @@ def _print(rows: list[dict], title: str) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, title=title)
-    hidden = ("against_first", "parameter", "value", "policy", "training_seed")
+    hidden = ("against_first", "parameter", "value", "policy", "training_seed", "noise")
     columns = [key for key in rows[0] if "_ci95" not in key and key not in hidden]
     for column in columns:
         table.add_column(column.replace("_", " "), justify="left" if column == "variant" else "right")
@@ -248,10 +279,13 @@ def _panels(part: Part, rows: list[dict]) -> list["Panel"]:
 
     if part is Part.PLANNING:
         return _trade_offs(rows)
-    third = ("reported", "hypotheses an object") if "reported" in rows[0] else ("distance_m", "d [m]")
+    reported = ("reported", "hypotheses an object")
+    share = ("gap_closed", "share of the gap on own noise")
+    third = {Part.FUSION: reported, Part.VERIFICATION: reported, Part.LUCK: share}.get(part, ("distance_m", "d [m]"))
     line, x, x_label = {
         Part.STEPS: ("variant", "budget", "T"),
         Part.SEEDS: ("policy", "training_seed", "seed of the training"),
+        Part.LUCK: ("noise", "policy", "views chosen by"),
     }.get(part, (None, "variant", part.value))
     panels = []
     for key, label in (("detection_rate", "detection rate"), ("e_add_mm", "e_ADD [mm]"), third):
