@@ -113,6 +113,30 @@ def test_ablations_go_across_objects():
     assert table["rule"] == [f"✓ {rate + 0.02:.3f}, ✗ {error:.2f} mm, = 4.00 m".replace("0.", ".", 1), ""]
 
 
+def test_what_luck_leaves_is_told_with_its_interval():
+    intervals, first = Intervals(SCENE), results(0.9, 8.0, 4.0).measures
+    row = {"policy": "oracle", "noise": "own", "gap_closed": 1.0, "gap_closed_ci95_scenes": [1.0, 1.0]}
+    other = {**row, "noise": "other", "gap_closed": 0.574, "gap_closed_ci95_scenes": [0.48, 0.667]}
+    own = {**row, **describe(first, intervals)}
+    other |= describe(results(0.8, 10.0, 4.0).measures, intervals, first)
+    rows = rows_of(tables.luck_table({"mug": {"rows": [own, other]}}))
+    rate, error = first["detection_rate"].mean(), first["e_add_mm"].mean()
+    assert rows["`oracle`, own noise"] == [f"{rate:.3f}, {error:.2f} mm, 100 %".removeprefix("0")]
+    told = f"✗ {rate - 0.1:.3f}, ✗ {error + 2:.2f} mm, 57 % (48 to 67)".replace("0.", ".", 1)
+    assert rows["`oracle`, other noise"] == [told]
+
+
+def test_budgets_go_down_and_policies_across():
+    rows = [
+        {"variant": name, "budget": T, **describe(results(0.5 + 0.1 * T, 10.0, 4.0).measures, Intervals(SCENE))}
+        for name in ("random", "unidirectional")
+        for T in (0, 3)
+    ]
+    text = tables.steps_tables({"bunny": {"rows": rows}, "mug": {"rows": rows[:2]}})
+    assert text.count("| T | `random` | `unidirectional` |") == text.count("| T | `random` |\n") == 1
+    assert list(rows_of(text.split("\n\n")[1])) == ["0", "3"]
+
+
 def test_goals_are_met_or_not(evaluated):
     attention = [describe(results(0.72, 12.0, 3.0).measures, Intervals(SCENE))]
     lowest = results(0.70, 14.0, 3.0).measures

@@ -131,19 +131,27 @@ def seeds_table(reports: Reports) -> str:
     return _pivot(reports, lambda row: row["variant"], tell)
 
 
-def steps_table(reports: Reports, policies: Sequence[str]) -> str:
-    """Budgets T down; found and e_ADD of policies on every object across."""
-    header, columns = ["T"], []
+def steps_tables(reports: Reports) -> str:
+    """Of every object: budgets T down, found and e_ADD of policies across."""
+    parts = []
     for name, report in reports.items():
-        for policy in policies:
-            own = {row["budget"]: row for row in report["rows"] if row["variant"] == policy}
-            header.append(f"{name}, `{policy}`")
-            columns.append(own)
-    budgets = sorted(set().union(*columns))
-    told = ("detection_rate", "e_add_mm")
-    return table(
-        header, ([str(T), *(describe_row(own[T], told) if T in own else "" for own in columns)] for T in budgets)
-    )
+        rows = {(row["budget"], row["variant"]): row for row in report["rows"]}
+        budgets, policies = (list(dict.fromkeys(names)) for names in zip(*rows, strict=True))
+        told = ("detection_rate", "e_add_mm")
+        lines = ([str(T), *(describe_row(rows[T, policy], told) for policy in policies)] for T in budgets)
+        parts += [f"**{name}**", table(["T", *(f"`{policy}`" for policy in policies)], lines)]
+    return "\n\n".join(parts)
+
+
+def luck_table(reports: Reports) -> str:
+    """Whose views and with which noise down: found, e_ADD, and the share of the gap with its interval over scenes."""
+
+    def tell(row: dict[str, Any]) -> str:
+        share, (low, high) = row["gap_closed"], row["gap_closed_ci95_scenes"]
+        ends = f" ({100 * low:.0f} to {100 * high:.0f})" if high - low > 0.005 else ""
+        return f"{describe_row(row, ('detection_rate', 'e_add_mm'))}, {percent(share)}{ends}"
+
+    return _pivot(reports, lambda row: f"`{row['policy']}`, {row['noise']} noise", tell)
 
 
 def _pivot(reports: Reports, key: Callable[[dict], str], tell: Callable[[dict], str]) -> str:
