@@ -19,6 +19,7 @@ from active6d_core.conversions import (
     attention_from_cloud,
     make_header,
     objects_to_cloud,
+    points_to_cloud,
     pose_stamped_to_transform,
     stamp_to_ns,
     transform_to_pose,
@@ -35,6 +36,7 @@ class Episode:
     def __init__(self, graph, make_objects, **overrides):
         self.graph = graph
         self.objects = make_objects([[0.1, 0, 0], [-0.1, 0, 0.05]], [0.9, 0.3])
+        self.unexplained = np.zeros((0, 3))
         self.goals = graph.mailbox(PoseStamped, "view_goal")
         self.attention = graph.mailbox(PointCloud2, "attention")
         self.ends = graph.mailbox(DiagnosticArray, "episode/end", latched=True)
@@ -56,6 +58,8 @@ class Episode:
     def view(self, view, stamp=None):
         self.stamp = self.stamp + SECOND if stamp is None else stamp
         self.pose(view, self.stamp)
+        cloud = points_to_cloud(self.unexplained, self.stamp, "world")
+        self.graph.publish("objects/unexplained", cloud, latched=True)
         self.graph.publish("objects", objects_to_cloud(self.objects, self.stamp, "world"), latched=True)
 
     def goal_views(self):

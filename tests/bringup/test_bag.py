@@ -43,6 +43,7 @@ def test_episode_is_read_back(tmp_path):
         np.testing.assert_array_equal(read.hypotheses.segmentation, sent.hypotheses.segmentation)
         assert_table(read.hypotheses, sent.hypotheses)
         assert_table(read.objects, sent.objects)
+        np.testing.assert_allclose(read.unexplained, sent.unexplained, atol=1e-7)
         assert read.latency_ms == {"pose_estimator": 12.5}
     for read, sent in zip(record.steps[:-1], episode.steps[:-1], strict=True):
         np.testing.assert_allclose(read.goal, sent.goal, atol=1e-12)

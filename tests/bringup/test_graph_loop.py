@@ -26,6 +26,7 @@ from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimator import create_estimator
 from active6d_perception.fusion import SceneFusion
+from active6d_perception.surface import SceneSurface
 from active6d_perception.verification import Verifier
 from active6d_sim.scene import Bin, Scene
 from active6d_sim.sensor import SensorNoise
@@ -128,6 +129,7 @@ def test_images_are_the_simulators(record, scene, settings):
 def test_perception_and_policy_are_the_core_functions(record):
     model = load_object("mug")
     estimator, verifier, fusion = create_estimator("geometric", model), Verifier(model), SceneFusion(model)
+    surface = SceneSurface(model)
     policy = create_policy("auto", model)
     policy.reset(np.random.default_rng([3, record.steps[0].stamp]))
     found_any = 0
@@ -141,14 +143,22 @@ def test_perception_and_policy_are_the_core_functions(record):
         fusion.add_view(
             view.stamp, view.T_world_camera, hypotheses, verifier.score(view.depth, view.camera, hypotheses)
         )
-        objects = objects_from_cloud(
-            objects_to_cloud(fusion.objects(view.stamp, view.T_world_camera, view.camera), view.stamp, "w"), "w"
-        )
+        fused = fusion.objects(view.stamp, view.T_world_camera, view.camera)
+        objects = objects_from_cloud(objects_to_cloud(fused, view.stamp, "w"), "w")
         assert_same(step.objects, objects)
+        surface.add_view(view.stamp, view.depth, view.camera, view.T_world_camera)
+        np.testing.assert_array_equal(step.unexplained, surface.unexplained(fused.T_world_object))
         found_any += len(objects)
         if step.goal is not None:
             positions = record.positions[: index + 1]
-            observation = Observation(step.objects, positions, SPHERE, np.ones(len(SPHERE), bool), MOVES - index)
+            observation = Observation(
+                step.objects,
+                positions,
+                SPHERE,
+                np.ones(len(SPHERE), bool),
+                MOVES - index,
+                unexplained=step.unexplained,
+            )
             decision = policy.decide(observation)
             np.testing.assert_allclose(step.goal[:3, 3], decision.position, atol=1e-12)
             np.testing.assert_allclose(step.attention, decision.attention, atol=1e-7)

@@ -24,6 +24,7 @@ from active6d_core.conversions import (
     info_to_camera,
     latencies_from_diagnostics,
     objects_from_cloud,
+    points_from_cloud,
     pose_stamped_to_transform,
     poses_from_array,
     stamp_to_ns,
@@ -43,6 +44,7 @@ class RecordedStep:
         view: the images, intrinsics and camera pose; ``view.stamp`` names the step.
         hypotheses: of this view, in the camera's frame, with ``hypotheses.segmentation``.
         objects: everything accumulated up to this view, in the world.
+        unexplained: (k, 3) places of the surface that is of none of the objects, in the world, metres.
         attention: (n,) weight per object.
         attended: index of the attended object.
         goal: ``T_world_camera`` (4, 4) that the policy asked for next.
@@ -52,6 +54,7 @@ class RecordedStep:
     view: View
     hypotheses: Hypotheses | None = None
     objects: SceneObjects | None = None
+    unexplained: np.ndarray | None = None
     attention: np.ndarray | None = None
     attended: int | None = None
     goal: np.ndarray | None = None
@@ -236,14 +239,16 @@ def _step(messages: dict[str, dict[int, Any]], latency_ms: dict[str, float], sta
         camera=info_to_camera(at["camera/color/camera_info"]),
         T_world_camera=pose_stamped_to_transform(at[POSE], world),
     )
-    hypotheses = objects = attention = attended = goal = None
+    hypotheses = objects = unexplained = attention = attended = goal = None
     if "hypotheses" in at and "hypotheses/segmentation" in at:
         segmentation = image_to_segmentation(at["hypotheses/segmentation"])
         hypotheses = hypotheses_from_cloud(at["hypotheses"], segmentation, depth.header.frame_id)
     if "objects" in at:
         objects = objects_from_cloud(at["objects"], world)
+    if "objects/unexplained" in at:
+        unexplained = points_from_cloud(at["objects/unexplained"], world)
     if "attention" in at:
         attention, attended = attention_from_cloud(at["attention"], world)
     if "view_goal" in at:
         goal = pose_stamped_to_transform(at["view_goal"], world)
-    return RecordedStep(view, hypotheses, objects, attention, attended, goal, latency_ms)
+    return RecordedStep(view, hypotheses, objects, unexplained, attention, attended, goal, latency_ms)

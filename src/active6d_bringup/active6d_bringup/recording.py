@@ -64,6 +64,7 @@ CONTRACT = (
     RecordedTopic("objects", "sensor_msgs/msg/PointCloud2", Per.VIEW, latched=True),
     RecordedTopic("objects/poses", "geometry_msgs/msg/PoseArray", Per.VIEW, latched=True),
     RecordedTopic("objects/markers", "visualization_msgs/msg/MarkerArray", Per.VIEW, latched=True),
+    RecordedTopic("objects/unexplained", "sensor_msgs/msg/PointCloud2", Per.VIEW, latched=True),
     RecordedTopic("attention", "sensor_msgs/msg/PointCloud2", Per.MOVE),
     RecordedTopic("view_goal", "geometry_msgs/msg/PoseStamped", Per.MOVE),
     RecordedTopic("episode/end", "diagnostic_msgs/msg/DiagnosticArray", Per.EPISODE, latched=True),

@@ -33,6 +33,7 @@ OBJECT_COLUMNS = {
     "support": "<u2",
     "spread": "<f4",
 }
+POINT_COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4"}
 ATTENTION_COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4", "weight": "<f4", "attended": "|u1"}
 
 _DATATYPES = {"<f4": PointField.FLOAT32, "<u2": PointField.UINT16, "|u1": PointField.UINT8}
@@ -45,6 +46,8 @@ _QUATERNION_TOLERANCE = 1e-2
 HARDWARE_ID = "active6d"
 #: More rows than any heap needs; fusion's memory grows with their square.
 _MAX_ROWS = 2000
+#: More points than the surface of any workspace has cells.
+_MAX_POINTS = 100_000
 
 
 class MessageError(ValueError):
@@ -335,6 +338,22 @@ def attention_from_cloud(message: PointCloud2, frame: str) -> tuple[np.ndarray, 
     return _read(table, "weight"), int(marked[0]) if len(marked) else None
 
 
+def points_to_cloud(points: np.ndarray, stamp: int, frame: str) -> PointCloud2:
+    """(k, 3) points in metres to a cloud of x, y and z."""
+    table = np.ascontiguousarray(points, "<f4").view(_layout(POINT_COLUMNS)).reshape(len(points))
+    return _table_to_cloud(table, stamp, frame)
+
+
+def points_from_cloud(message: PointCloud2, frame: str) -> np.ndarray:
+    """A cloud to its (k, 3) points in metres; other columns are ignored.
+
+    Raises:
+        MessageError: another frame, too many points, a missing column or a number that is not finite.
+    """
+    table = _cloud_to_table(message, POINT_COLUMNS, frame, most=_MAX_POINTS)
+    return np.column_stack([_read(table, column) for column in POINT_COLUMNS])
+
+
 def _layout(columns: dict[str, str]) -> np.dtype:
     return np.dtype(list(columns.items()), align=True)
 
@@ -352,14 +371,14 @@ def _table_to_cloud(table: np.ndarray, stamp: int, frame: str) -> PointCloud2:
     return cloud
 
 
-def _cloud_to_table(message: PointCloud2, columns: dict[str, str], frame: str) -> np.ndarray:
+def _cloud_to_table(message: PointCloud2, columns: dict[str, str], frame: str, most: int = _MAX_ROWS) -> np.ndarray:
     """A cloud's named columns as a structured array; other columns and any padding are ignored."""
     require_frame(message.header, frame)
     if message.is_bigendian:
         raise MessageError("big-endian tables are not supported")
     rows = message.width * message.height
-    if rows > _MAX_ROWS:
-        raise MessageError(f"table of {rows} rows, more than {_MAX_ROWS}")
+    if rows > most:
+        raise MessageError(f"table of {rows} rows, more than {most}")
     if message.row_step != message.point_step * message.width or len(message.data) != message.row_step * message.height:
         raise MessageError(
             f"table of {rows} rows has steps {message.point_step}, {message.row_step} and {len(message.data)} bytes"

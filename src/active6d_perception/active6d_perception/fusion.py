@@ -15,6 +15,7 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert
 from active6d_perception.clustering import cluster, suppress_neighbours
 from active6d_perception.model_views import ModelViews, model_views
+from active6d_perception.surface import EXPLAINED_WITHIN
 from active6d_perception.symmetric_distance import SymmetricDistance
 
 #: Ways to rank hypotheses, see :attr:`FusionParameters.rank_by`.
@@ -48,7 +49,7 @@ class FusionParameters:
     exclusion: float = 0.2
     min_verification: float = -1.0
     rank_by: str = "evidence"
-    explained_within: float = 0.08
+    explained_within: float = EXPLAINED_WITHIN
 
     def __post_init__(self) -> None:
         if not self.cut > 0:

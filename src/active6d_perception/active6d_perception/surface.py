@@ -19,6 +19,9 @@ _STRIDE = 2
 _LEAST_POINTS = 3
 # Edge of a voxel of the distance field, in diameters.
 _VOXEL = 1 / 48
+#: Default of how near surface is to an object that explains it, in diameters: more would take surface of its
+#: neighbours for the object's, less would leave what poses that are a little off do not reach.
+EXPLAINED_WITHIN = 0.08
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,9 @@ class SurfaceGrid:
 
     @cached_property
     def centres(self) -> np.ndarray:
-        """(cells, 3) metres in the world."""
-        return self.low + (np.indices(self.shape).reshape(3, -1).T + 0.5) * self.cell
+        """(cells, 3) metres in the world, numbers that float32 holds: messages carry no others."""
+        centres = self.low + (np.indices(self.shape).reshape(3, -1).T + 0.5) * self.cell
+        return centres.astype(np.float32).astype(float)
 
     def observe(self, depth: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray) -> np.ndarray:
         """The cells that a view shows surface in.
@@ -148,18 +152,22 @@ class SceneSurface:
 
     Args:
         model: the object.
-        grid: of the workspace.
+        grid: of the workspace; the one over the object's usual bin when None.
         within: see :class:`Explainer`.
     """
 
-    def __init__(self, model: ObjectModel, grid: SurfaceGrid, within: float) -> None:
-        self.grid = grid
+    def __init__(self, model: ObjectModel, grid: SurfaceGrid | None = None, within: float = EXPLAINED_WITHIN) -> None:
+        self.grid = grid or SurfaceGrid.for_model(model)
         self._explainer = explainer(model, within)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all views."""
         self._seen: dict[int, np.ndarray] = {}
 
-    def add_view(self, stamp: int, seen: np.ndarray) -> None:
-        """Take in the (cells,) bool that the view of a stamp (ns) shows; once more changes nothing."""
-        self._seen[stamp] = seen
+    def add_view(self, stamp: int, depth: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray) -> None:
+        """Take in a view, identified by its stamp (ns); arguments as of :meth:`SurfaceGrid.observe`."""
+        self._seen[stamp] = self.grid.observe(depth, camera, T_world_camera)
 
     def forget_before(self, stamp: int) -> None:
         """Forget the views older than ``stamp`` in nanoseconds."""

@@ -14,6 +14,7 @@ from active6d_core.conversions import (
     attention_to_cloud,
     make_header,
     objects_from_cloud,
+    points_from_cloud,
     pose_stamped_to_transform,
     stamp_to_ns,
     transform_to_pose,
@@ -35,7 +36,8 @@ class _Episode:
 
 
 class AttentionPolicyNode(GraphNode):
-    """Publishes ``attention`` and ``view_goal`` once ``objects`` and ``camera/pose`` of a stamp are there, T times.
+    """Publishes ``attention`` and ``view_goal`` once a stamp's ``objects``, ``objects/unexplained`` and ``camera/pose``
+    are there, T times.
 
     After the T-th move, or when the policy stops, ``episode/end`` says why. A newer ``episode/start`` begins the next
     episode; without one (a camera that knows no episodes) the first view does. The same view again publishes the same
@@ -62,6 +64,7 @@ class AttentionPolicyNode(GraphNode):
         self.goal = self.output(PoseStamped, "view_goal")
         self.end = self.output(DiagnosticArray, "episode/end", latched=True)
         self.input(PointCloud2, "objects", self._on_objects, latched=True)
+        self.input(PointCloud2, "objects/unexplained", self._on_unexplained, latched=True)
         self.camera_input(PoseStamped, "camera/pose", self._on_pose, latched)
         self.input(DiagnosticArray, "episode/start", self._on_start, latched=True)
         self._forget()
@@ -79,9 +82,9 @@ class AttentionPolicyNode(GraphNode):
 
     def _forget(self) -> None:
         self._episode: _Episode | None = None
-        self._latest: tuple[int, SceneObjects] | None = None
+        self._latest: tuple[int, SceneObjects, np.ndarray] | None = None
         self._published: list = []
-        self._pairs = StampSynchronizer(["objects", "camera/pose"], self._on_view)
+        self._views = StampSynchronizer(["objects", "objects/unexplained", "camera/pose"], self._on_view)
 
     def _declare_views(self) -> tuple[ViewSphere, np.ndarray]:
         """The grid of views and which of them the robot can reach."""
@@ -123,31 +126,40 @@ class AttentionPolicyNode(GraphNode):
     def _on_objects(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
         objects = objects_from_cloud(message, self.world_frame)
-        if self._latest is not None and stamp == self._latest[0]:
+        if self._is_latest(stamp):
             for publisher, published in self._published:
                 publisher.publish(published)
             return
-        self._pairs.add("objects", stamp, objects)
+        self._views.add("objects", stamp, objects)
+
+    def _on_unexplained(self, message: PointCloud2) -> None:
+        stamp = stamp_to_ns(message.header.stamp)
+        points = points_from_cloud(message, self.world_frame)
+        if not self._is_latest(stamp):
+            self._views.add("objects/unexplained", stamp, points)
 
     def _on_pose(self, message: PoseStamped) -> None:
         stamp = stamp_to_ns(message.header.stamp)
         T_world_camera = pose_stamped_to_transform(message, self.world_frame)
-        if self._latest is None or stamp != self._latest[0]:
-            self._pairs.add("camera/pose", stamp, T_world_camera[:3, 3])
+        if not self._is_latest(stamp):
+            self._views.add("camera/pose", stamp, T_world_camera[:3, 3])
+
+    def _is_latest(self, stamp: int) -> bool:
+        return self._latest is not None and stamp == self._latest[0]
 
     def _on_view(self, stamp: int, view: dict) -> None:
         if self._episode is None:
             self._begin_episode(stamp)
         if stamp < self._episode.start:
             raise MessageError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
-        self._latest = (stamp, view["objects"])
+        self._latest = (stamp, view["objects"], view["objects/unexplained"])
         self._episode.positions[stamp] = view["camera/pose"]
         self._published = []
         if not self._episode.ended:
             with self.measure(stamp):
                 self._decide(*self._latest)
 
-    def _decide(self, stamp: int, objects: SceneObjects) -> None:
+    def _decide(self, stamp: int, objects: SceneObjects, unexplained: np.ndarray) -> None:
         positions = np.stack(list(self._episode.positions.values()))
         travelled = self.sphere.path_length(positions)
         steps_left = self.steps - (len(positions) - 1)
@@ -155,7 +167,9 @@ class AttentionPolicyNode(GraphNode):
             self._finish(stamp, f"budget of {self.steps} moves spent", positions, travelled)
             return
         metres_left = self.metres - travelled if self.metres > 0 else np.inf
-        observation = Observation(objects, positions, self.sphere, self.allowed, steps_left, metres_left)
+        observation = Observation(
+            objects, positions, self.sphere, self.allowed, steps_left, metres_left, unexplained=unexplained
+        )
         decision = self.policy.decide(observation)
         self._publish_attention(stamp, objects, decision)
         if decision.stop:

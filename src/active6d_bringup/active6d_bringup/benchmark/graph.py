@@ -204,9 +204,10 @@ def _direct(prepared: PreparedViews) -> tuple[np.ndarray, np.ndarray]:
     """Seconds per view of the core functions, and of those the part of verification and fusion."""
     from active6d_agent.policy import Observation, create_policy
     from active6d_perception.fusion import SceneFusion
+    from active6d_perception.surface import SceneSurface
     from active6d_perception.verification import Verifier
 
-    verifier, fusion = Verifier(prepared.model), SceneFusion(prepared.model)
+    verifier, fusion, surface = Verifier(prepared.model), SceneFusion(prepared.model), SceneSurface(prepared.model)
     policy, sphere = create_policy("lowest-score", prepared.model), ViewSphere()
     policy.reset(np.random.default_rng(0))
     allowed, positions = np.ones(len(sphere), bool), []
@@ -216,10 +217,12 @@ def _direct(prepared: PreparedViews) -> tuple[np.ndarray, np.ndarray]:
         found = prepared.hypotheses[view.stamp]
         scores = verifier.score(view.depth, view.camera, found)
         fusion.add_view(view.stamp, view.T_world_camera, found, scores)
+        surface.add_view(view.stamp, view.depth, view.camera, view.T_world_camera)
         objects = fusion.objects(view.stamp, view.T_world_camera, view.camera)
+        unexplained = surface.unexplained(objects.T_world_object)
         fused = time.perf_counter()
         positions.append(view.T_world_camera[:3, 3])
-        policy.decide(Observation(objects, np.array(positions), sphere, allowed, left))
+        policy.decide(Observation(objects, np.array(positions), sphere, allowed, left, unexplained=unexplained))
         total.append(time.perf_counter() - began)
         fusing.append(fused - began)
     return np.array(total), np.array(fusing)

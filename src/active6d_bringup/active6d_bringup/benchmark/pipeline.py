@@ -22,6 +22,7 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.fusion import SceneFusion
+from active6d_perception.surface import SceneSurface
 from active6d_perception.verification import Verifier
 
 VIEWS = 6
@@ -37,7 +38,7 @@ class LastViewTimes:
 
     Attributes:
         verification: (r,) of its hypotheses.
-        fusion: (r,) of them with all earlier ones.
+        fusion: (r,) of them with all earlier ones, and of the surface that the view shows.
         policy: (r,) of the decision.
         objects: that fusion made of all.
     """
@@ -120,7 +121,8 @@ def time_last_view(
     prepared: PreparedViews, found: list[Hypotheses], verifier: Verifier, policy: Policy, repeats: int
 ) -> LastViewTimes:
     """Verify, fuse and decide on the last view, again and again, with the earlier ones known."""
-    fusion, sphere = SceneFusion(prepared.model), ViewSphere()
+    model, sphere = prepared.model, ViewSphere()
+    fusion, surface = SceneFusion(model), SceneSurface(model)
     *earlier, (last, hypotheses) = zip(prepared.views, found, strict=True)
     known = [(view, one, verifier.score(view.depth, view.camera, one)) for view, one in earlier]
     positions = np.array([view.T_world_camera[:3, 3] for view in prepared.views])
@@ -129,15 +131,20 @@ def time_last_view(
     seconds = np.zeros((repeats + 1, 3))
     for row in seconds:
         fusion.reset()
+        surface.reset()
         for view, one, scores in known:
             fusion.add_view(view.stamp, view.T_world_camera, one, scores)
+            surface.add_view(view.stamp, view.depth, view.camera, view.T_world_camera)
         began = time.perf_counter()
         scores = verifier.score(last.depth, last.camera, hypotheses)
         verified = time.perf_counter()
         fusion.add_view(last.stamp, last.T_world_camera, hypotheses, scores)
+        surface.add_view(last.stamp, last.depth, last.camera, last.T_world_camera)
         objects = fusion.objects(last.stamp, last.T_world_camera, last.camera)
+        unexplained = surface.unexplained(objects.T_world_object)
         fused = time.perf_counter()
-        policy.decide(Observation(objects, positions, sphere, np.ones(len(sphere), bool), 5))
+        allowed = np.ones(len(sphere), bool)
+        policy.decide(Observation(objects, positions, sphere, allowed, 5, unexplained=unexplained))
         row[:] = verified - began, fused - verified, time.perf_counter() - fused
     return LastViewTimes(*seconds[1:].T, objects=len(objects))
 

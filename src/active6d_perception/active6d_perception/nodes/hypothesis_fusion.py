@@ -1,6 +1,10 @@
-"""Verifies every view's hypotheses against its depth image and fuses them with those of earlier views."""
+"""Verifies every view's hypotheses against its depth image and fuses them with those of earlier views.
+
+Also tells what of the surface in the depth images the fused objects do not explain.
+"""
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +20,7 @@ from active6d_core.conversions import (
     image_to_segmentation,
     objects_to_cloud,
     objects_to_markers,
+    points_to_cloud,
     poses_to_array,
     require_frame,
     stamp_to_ns,
@@ -27,11 +32,13 @@ from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.optional_outputs import DetectionOutput
 from active6d_perception.fusion import RANKINGS, FusionParameters, SceneFusion
 from active6d_perception.nodes.view_inputs import ViewInputs
+from active6d_perception.surface import SceneSurface, SurfaceGrid
 from active6d_perception.verification import Verifier
 
 
 class HypothesisFusionNode(GraphNode):
-    """Hypotheses with masks, depth and camera pose in; ``objects``, ``objects/poses`` and ``objects/markers`` out.
+    """Hypotheses with masks, depth and camera pose in; ``objects``, ``objects/poses``, ``objects/markers`` and
+    ``objects/unexplained`` out.
 
     Where vision_msgs is installed, the objects also go out as ``objects/detections``.
     """
@@ -64,10 +71,33 @@ class HypothesisFusionNode(GraphNode):
                 "what makes hypotheses and clusters the best: equation 1, the estimator's score, both, or their sum",
                 choices=RANKINGS,
             ),
+            explained_within=self.declare(
+                "explained_within",
+                FusionParameters.explained_within,
+                "surface this near to an object is the object's, as a fraction of the diameter; less reports more as "
+                "unexplained, from poses that are a little off at last",
+                minimum=1e-3,
+                maximum=1.0,
+            ),
         )
+        self._workspace = {
+            "width": self.declare(
+                "workspace_width",
+                [0.0, 0.0],
+                "sides along world x and y, about the origin, of the box in which unexplained surface is looked for, "
+                "metres; walls should be outside; 0 for those of the object's usual bin less a margin",
+            ),
+            "floor": self.declare(
+                "workspace_floor", 0.0, "lower end of that box along world z, metres; 0 for 5 % of the diameter"
+            ),
+            "height": self.declare(
+                "workspace_height", 0.0, "its upper end, metres; 0 for one and a half diameters", minimum=0.0
+            ),
+        }
         self._objects = self.output(PointCloud2, "objects", latched=True)
         self._poses = self.output(PoseArray, "objects/poses", latched=True)
         self._markers = self.output(MarkerArray, "objects/markers", latched=True)
+        self._unexplained = self.output(PointCloud2, "objects/unexplained", latched=True)
         self._detections = DetectionOutput(self, "objects/detections")
         # First, for the executor calls back in this order: a new episode is known before its first view.
         self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
@@ -83,11 +113,21 @@ class HypothesisFusionNode(GraphNode):
         self._model = load_object(self._object)
         self._verifier = Verifier(self._model, self._epsilon, self._samples)
         self._fusion = SceneFusion(self._model, self._fusion_parameters)
+        self._surface = SceneSurface(self._model, self._make_grid(), self._fusion_parameters.explained_within)
         try:
             self._mesh_uri = export_mesh(self._model)
         except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
             self._mesh_uri = None
             self.get_logger().warning(f"objects/markers stays empty, the mesh cannot be written for viewers: {error}")
+
+    def _make_grid(self) -> SurfaceGrid:
+        usual = SurfaceGrid.for_model(self._model)
+        sides = zip(self._workspace["width"], usual.width, strict=False)
+        given = {name: value for name, value in self._workspace.items() if name != "width" and value != 0}
+        try:
+            return replace(usual, width=tuple(side or own for side, own in sides), **given)
+        except ValueError as error:
+            raise ValueError(f"{self.get_name()}: parameters 'workspace_*': {error}") from error
 
     def _on_hypotheses(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
@@ -105,6 +145,7 @@ class HypothesisFusionNode(GraphNode):
     def _on_episode_start(self, message: DiagnosticArray) -> None:
         start = self._episode_start = stamp_to_ns(message.header.stamp)
         self._fusion.forget_before(start)
+        self._surface.forget_before(start)
         if self._latest is not None and self._latest[0] >= start:
             self._publish()  # the first view overtook the announcement of its episode
 
@@ -115,6 +156,7 @@ class HypothesisFusionNode(GraphNode):
         with self.measure(stamp):
             verification = self._verifier.score(values["depth"], values["camera"], hypotheses)
             self._fusion.add_view(stamp, values["pose"], hypotheses, verification)
+            self._surface.add_view(stamp, values["depth"], values["camera"], values["pose"])
             self._latest = stamp, values["pose"], values["camera"]
             self._publish()
 
@@ -128,6 +170,8 @@ class HypothesisFusionNode(GraphNode):
         self._poses.publish(poses_to_array(objects.T_world_object, stamp, self.world_frame))
         shown = objects if self._mesh_uri else SceneObjects.empty()
         self._markers.publish(objects_to_markers(shown, self._mesh_uri or "", stamp, self.world_frame))
+        unexplained = self._surface.unexplained(objects.T_world_object)
+        self._unexplained.publish(points_to_cloud(unexplained, stamp, self.world_frame))
         self._detections.publish(objects, self._model, stamp, self.world_frame)
 
 
