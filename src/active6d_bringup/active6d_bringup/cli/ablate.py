@@ -68,17 +68,14 @@ def ablate(
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """
-    from active6d_agent.bank import find_bank, load_bank
+    from active6d_agent.bank import load_bank
     from active6d_agent.evaluation import all_starts
     from active6d_agent.lookup import BankLookup
     from active6d_bringup.cli.episode import parse_overrides
     from active6d_bringup.report.lines import draw_panels
 
-    splits = {Part.SEEDS: ("val", "test"), **dict.fromkeys(_TRAINED, ("train", "val", "test"))}.get(part, ("test",))
-    paths = {split: find_bank(object_name, split, banks) for split in splits}
+    paths = _find_banks(part, object_name, banks)
     parameters = parse_overrides(override or [])
-    if part is Part.LUCK:
-        paths["again"] = find_bank(object_name, "test", banks, _AGAIN)
     if part is Part.SEEDS:
         weights = _train_seeds(object_name, out, steps, banks)
     with messages.status("reading the banks"):
@@ -101,9 +98,17 @@ def ablate(
     if png is not None:
         draw_panels(png, f"{part.value}, {object_name}", _panels(part, rows))
         messages.print(f"wrote {png}", highlight=False)
-    bank = lookups["test"].bank.provenance
     common = {"object": object_name, "part": part.value, "steps": steps, "episodes": len(starts), "seed": seed}
-    write_json(json_file, {**common, "bank": bank, "rows": rows})
+    write_json(json_file, {**common, "bank": lookups["test"].bank.provenance, "rows": rows})
+
+
+def _find_banks(part: Part, object_name: str, folder: Path | None) -> dict[str, Path]:
+    """The banks of the splits that a part needs, and the test scenes' second one as ``again``."""
+    from active6d_agent.bank import find_bank
+
+    splits = {Part.SEEDS: ("val", "test"), **dict.fromkeys(_TRAINED, ("train", "val", "test"))}.get(part, ("test",))
+    paths = {split: find_bank(object_name, split, folder) for split in splits}
+    return paths | ({"again": find_bank(object_name, "test", folder, _AGAIN)} if part is Part.LUCK else {})
 
 
 def _folder(out: Path | None, object_name: str) -> Path:
