@@ -15,6 +15,7 @@ from active6d_agent.attention import AttentionNetwork, save_network
 from active6d_agent.environment import Active6DEnv
 from active6d_agent.lookup import BankLookup
 from active6d_agent.nodes.attention_policy import AttentionPolicyNode
+from active6d_agent.policy import Decision, register_policy
 from active6d_core.conversions import (
     attention_from_cloud,
     make_header,
@@ -202,6 +203,56 @@ def test_bad_objects_are_refused_and_the_node_lives(episode, damage, complaint):
     assert not played.goals
     played.view(3, SECOND)
     played.graph.spin_until(lambda: len(played.goals) == 1)
+
+
+def not_a_number_of_a_point(cloud):
+    cloud.data[8:12] = array.array("B", np.float32(np.inf).tobytes())
+
+
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (wrong_frame, "frame_id is 'map'"),
+        (cut_short, "bytes"),
+        (lost_column, "column 'x'"),
+        (not_a_number_of_a_point, "'z' holds a number that is not finite"),
+    ],
+)
+def test_bad_surface_is_refused_and_the_node_lives(episode, damage, complaint):
+    played = episode()
+    cloud = points_to_cloud(np.ones((3, 3)), SECOND, "world")
+    damage(cloud)
+    played.graph.publish("objects/unexplained", cloud, latched=True)
+    played.graph.spin_until(lambda: any(complaint in error for error in played.errors()), what=complaint)
+    assert not played.goals
+    played.view(3, SECOND)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+
+
+@register_policy("watching")
+class Watching:
+    """Remembers what it saw."""
+
+    def __init__(self, model):
+        self.seen = []
+
+    def reset(self, rng):
+        self.seen.clear()
+
+    def decide(self, observation):
+        self.seen.append(observation)
+        return Decision.go_to(observation, int(np.flatnonzero(observation.candidates())[0]))
+
+
+def test_the_policy_sees_the_unexplained_surface_of_its_view(episode):
+    played = episode(policy="watching")
+    for count in (4, 0):
+        played.unexplained = np.random.default_rng(count).uniform(-0.1, 0.1, (count, 3)).astype(np.float32)
+        goals = len(played.goals)
+        played.view(10 + goals)
+        played.graph.spin_until(lambda goals=goals: len(played.goals) > goals)
+        np.testing.assert_array_equal(played.node.policy.seen[-1].unexplained, played.unexplained)
+    assert played.errors() == []
 
 
 @pytest.mark.parametrize(

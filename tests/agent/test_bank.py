@@ -106,6 +106,9 @@ def test_observing_a_scene_pairs_hypotheses_with_the_truth():
     )
     expected = e_add(model, T[0], truth)
     np.testing.assert_allclose(scene.errors[0], np.where(expected < 0.05, expected, np.inf), atol=1e-6)
+    view = capture(SPHERE.pose(SPHERE.positions[7]), 0)
+    seen = GRID.observe(view.depth, camera, view.T_world_camera)
+    np.testing.assert_array_equal(np.unpackbits(scene.surface[7], count=len(GRID)).view(bool), seen)
     areas = np.array([21, 1, 1, 1]) / 24
     np.testing.assert_allclose(scene.entropy, -(areas * np.log(areas)).sum())
 
@@ -119,6 +122,16 @@ def damage_header(data):
     data["header"] = np.array(json.dumps({**json.loads(str(data["header"])), "format": 99}))
 
 
+def old_format(data):
+    header = {**json.loads(str(data["header"])), "format": 1}
+    del header["surface"], data["surface"]
+    data["header"] = np.array(json.dumps(header))
+
+
+def cut_surface(data):
+    data["surface"] = data["surface"][:, :-100]
+
+
 def cut_table(data):
     data["table"] = data["table"][:-5]
 
@@ -128,7 +141,14 @@ def poison_table(data):
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"), [(damage_header, "format 99"), (cut_table, "table"), (poison_table, "finite")]
+    ("damage", "message"),
+    [
+        (damage_header, "format 99"),
+        (old_format, r"format 1, this version reads 2\); make it anew with 'active6d bank'"),
+        (cut_table, "table"),
+        (poison_table, "finite"),
+        (cut_surface, "surface has shape"),
+    ],
 )
 def test_a_damaged_bank_is_refused_with_its_name(tmp_path, damage, message):
     path = tmp_path / "bank.npz"

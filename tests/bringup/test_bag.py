@@ -76,6 +76,13 @@ def test_recording_cut_off_in_the_middle_keeps_its_views(tmp_path):
     assert record.steps[1].hypotheses is None
 
 
+def test_a_bag_of_before_the_unexplained_surface_is_read(tmp_path):
+    messages = [item for item in StubEpisode().messages() if item[0] != "objects/unexplained"]
+    record = read_episode(write_bag(tmp_path / "bag", messages))
+    assert len(record.steps) == 3
+    assert all(step.unexplained is None and len(step.objects) for step in record.steps)
+
+
 def test_camera_alone_is_an_episode(tmp_path):
     messages = [item for item in StubEpisode().messages() if item[0].startswith("camera/")]
     record = read_episode(write_bag(tmp_path / "bag", messages))

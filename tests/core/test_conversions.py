@@ -254,6 +254,30 @@ def test_attention_comes_back(attended):
     assert index == attended
 
 
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_points_come_back(count):
+    points = np.random.default_rng(0).uniform(-1, 1, (count, 3))
+    cloud = through_the_wire(conversions.points_to_cloud(points, 3, "world"))
+    assert (cloud.width, cloud.point_step, len(cloud.fields)) == (count, 12, 3)
+    back = conversions.points_from_cloud(cloud, "world")
+    np.testing.assert_array_equal(back, points.astype(np.float32))
+    with pytest.raises(MessageError, match="frame_id is 'world', expected 'map'"):
+        conversions.points_from_cloud(cloud, "map")
+
+
+def test_points_that_cannot_be_used_are_refused():
+    cloud = conversions.points_to_cloud(np.full((2, 3), np.nan), 3, "world")
+    with pytest.raises(MessageError, match="'x' holds a number that is not finite"):
+        conversions.points_from_cloud(cloud, "world")
+    cloud = conversions.points_to_cloud(np.zeros((100_001, 3)), 3, "world")
+    with pytest.raises(MessageError, match="100001 rows, more than 100000"):
+        conversions.points_from_cloud(cloud, "world")
+    cloud = conversions.points_to_cloud(np.zeros((2, 3)), 3, "world")
+    cloud.fields[2].name = "w"
+    with pytest.raises(MessageError, match="no usable column 'z'"):
+        conversions.points_from_cloud(cloud, "world")
+
+
 def test_tables_too_long_for_any_heap_are_refused():
     hypotheses = random_hypotheses(3)
     cloud = conversions.hypotheses_to_cloud(hypotheses, 1, FRAME)

@@ -18,6 +18,7 @@ from active6d_core.conversions import (
     image_to_segmentation,
     ns_to_stamp,
     objects_from_cloud,
+    points_from_cloud,
     segmentation_to_image,
     stamp_to_ns,
     transform_to_pose_stamped,
@@ -30,6 +31,7 @@ from active6d_perception.estimator import register_estimator
 from active6d_perception.fusion import SceneFusion
 from active6d_perception.nodes.hypothesis_fusion import HypothesisFusionNode
 from active6d_perception.nodes.pose_estimator import PoseEstimatorNode
+from active6d_perception.surface import SceneSurface, SurfaceGrid
 from active6d_perception.verification import Verifier
 
 FRAME = "camera_optical_frame"
@@ -230,6 +232,73 @@ def test_fusion_publishes_verified_objects(graph, fusion, seen, tmp_path):
     assert len(poses[0].poses) == 1
     assert markers[0].markers[1].mesh_resource == (tmp_path / "active6d/meshes/mug.stl").as_uri()
     assert (tmp_path / "active6d/meshes/mug.stl").stat().st_size > 1000
+
+
+def box_on_the_floor(stamp, left=60):
+    """A view of a box that nobody has a hypothesis of."""
+    depth = np.full((CAMERA.height, CAMERA.width), np.nan, np.float32)
+    depth[50:70, left : left + 30] = 0.72
+    empty = Hypotheses.empty(CAMERA.height, CAMERA.width)
+    return depth, fusion_messages((depth, empty), stamp)
+
+
+def unexplained_by_nothing(depths, grid=None):
+    surface = SceneSurface(load_object("mug"), grid)
+    for stamp, depth in enumerate(depths):
+        surface.add_view(stamp, depth, CAMERA, SPHERE.pose(SPHERE.positions[3]))
+    return surface.unexplained(np.zeros((0, 4, 4)))
+
+
+def test_unexplained_surface_adds_up_within_an_episode(graph, fusion):
+    clouds = graph.mailbox(PointCloud2, "objects/unexplained", True)
+    first, messages = box_on_the_floor(SECOND)
+    send(graph, messages, FUSION_INPUTS)
+    graph.spin_until_filled([clouds])
+    assert stamp_to_ns(clouds[0].header.stamp) == SECOND
+    np.testing.assert_array_equal(points_from_cloud(clouds[0], "world"), unexplained_by_nothing([first]))
+    second, messages = box_on_the_floor(2 * SECOND, left=40)
+    send(graph, messages, FUSION_INPUTS)
+    graph.spin_until_filled([clouds], 2)
+    both = unexplained_by_nothing([first, second])
+    np.testing.assert_array_equal(points_from_cloud(clouds[1], "world"), both)
+    start = DiagnosticArray(status=[DiagnosticStatus()])
+    start.header.stamp = ns_to_stamp(3 * SECOND)
+    graph.publish("episode/start", start, latched=True)
+    send(graph, box_on_the_floor(3 * SECOND, left=40)[1], FUSION_INPUTS)
+    graph.spin_until_filled([clouds], 3)
+    alone = unexplained_by_nothing([second])
+    np.testing.assert_array_equal(points_from_cloud(clouds[2], "world"), alone)
+    assert 0 < len(alone) < len(both)
+
+
+def test_the_workspace_is_the_parameters(graph, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    clouds = graph.mailbox(PointCloud2, "objects/unexplained", True)
+    overrides = {"workspace_width": [0.0, 0.1], "workspace_floor": 0.03, "workspace_height": 0.3}
+    graph.add(HypothesisFusionNode(context=graph.context, overrides=overrides))
+    depth, messages = box_on_the_floor(SECOND)
+    send(graph, messages, FUSION_INPUTS)
+    graph.spin_until_filled([clouds])
+    usual = SurfaceGrid.for_model(load_object("mug"))
+    grid = SurfaceGrid((usual.width[0], 0.1), 0.03, 0.3, usual.cell)
+    expected = unexplained_by_nothing([depth], grid)
+    np.testing.assert_array_equal(points_from_cloud(clouds[0], "world"), expected)
+    assert len(expected) > 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "text"),
+    [
+        ({"workspace_width": [0.3]}, r"hypothesis_fusion: parameters 'workspace_\*': .* finite"),
+        ({"workspace_width": [0.3, -0.3]}, r"'workspace_\*': .* expected one to a million"),
+        ({"workspace_height": 0.001}, r"'workspace_\*'"),
+        ({"workspace_floor": float("nan")}, r"'workspace_\*'"),
+        ({"explained_within": 0.0}, "parameter 'explained_within' is 0.0"),
+    ],
+)
+def test_bad_workspaces_are_named(graph, overrides, text):
+    with pytest.raises(ValueError, match=text):
+        graph.add(HypothesisFusionNode(context=graph.context, overrides=overrides))
 
 
 def test_fusion_without_a_writable_cache_sends_no_markers(graph, seen, tmp_path, monkeypatch):

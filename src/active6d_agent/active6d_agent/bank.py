@@ -308,7 +308,7 @@ def load_bank(path: Path) -> SceneBank:
         scenes = [_read_scene(data, index, name) for index, name in enumerate(header["scenes"])]
         return SceneBank(header["object"], sphere, grid, scenes, header["provenance"])
     except Exception as error:  # numpy raises many kinds on damaged archives
-        raise ValueError(f"{path}: not a scene bank ({error}); make it with 'active6d bank'") from error
+        raise ValueError(f"{path}: not a scene bank ({error}); make it anew with 'active6d bank'") from error
 
 
 def _read_scene(data: dict[str, np.ndarray], index: int, name: str) -> BankScene:

@@ -14,8 +14,9 @@ import open3d as o3d
 from active6d_core.camera import PinholeCamera, pixel_rays
 from active6d_core.object_model import ObjectModel
 
-# Every second pixel each way is looked at; a cell counts as seen with this many of them in it.
-_STRIDE = 2
+# Images are thinned to about this focal length in pixels (every second pixel each way of a VGA image), so that what is
+# seen depends little on their resolution; a cell counts as seen with this many pixels in it.
+_FOCAL = 277.0
 _LEAST_POINTS = 3
 # Edge of a voxel of the distance field, in diameters.
 _VOXEL = 1 / 48
@@ -89,8 +90,14 @@ class SurfaceGrid:
 
         Returns:
             (cells,) bool.
+
+        Raises:
+            ValueError: the depth image is not of the camera's size.
         """
-        z = depth[::_STRIDE, ::_STRIDE].ravel()
+        if depth.shape != (camera.height, camera.width):
+            raise ValueError(f"depth image is {depth.shape}, the camera's are {(camera.height, camera.width)}")
+        stride = _stride(camera)
+        z = depth[::stride, ::stride].ravel()
         R, t = T_world_camera[:3, :3] / self.cell, (T_world_camera[:3, 3] - self.low) / self.cell
         index = R.astype(np.float32) @ _rays(camera) * z + t.astype(np.float32)[:, None]
         inside = np.ones(len(z), bool)
@@ -103,7 +110,12 @@ class SurfaceGrid:
 @lru_cache(maxsize=4)
 def _rays(camera: PinholeCamera) -> np.ndarray:
     """(3, n) rays with z = 1 through the pixels that are looked at."""
-    return np.ascontiguousarray(pixel_rays(camera)[::_STRIDE, ::_STRIDE].reshape(-1, 3).T)
+    stride = _stride(camera)
+    return np.ascontiguousarray(pixel_rays(camera)[::stride, ::stride].reshape(-1, 3).T)
+
+
+def _stride(camera: PinholeCamera) -> int:
+    return max(1, round(camera.fx / _FOCAL))
 
 
 class Explainer:

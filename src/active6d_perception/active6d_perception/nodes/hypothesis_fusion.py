@@ -74,8 +74,8 @@ class HypothesisFusionNode(GraphNode):
             explained_within=self.declare(
                 "explained_within",
                 FusionParameters.explained_within,
-                "surface this near to an object is the object's, as a fraction of the diameter; less reports more as "
-                "unexplained, from poses that are a little off at last",
+                "surface this near to an object is that object's, as a fraction of the diameter; with less, poses that "
+                "are a little off leave surface of found objects unexplained",
                 minimum=1e-3,
                 maximum=1.0,
             ),
@@ -84,14 +84,20 @@ class HypothesisFusionNode(GraphNode):
             "width": self.declare(
                 "workspace_width",
                 [0.0, 0.0],
-                "sides along world x and y, about the origin, of the box in which unexplained surface is looked for, "
+                "sides, along world x and y about the origin, of the box in which unexplained surface is looked for, "
                 "metres; walls should be outside; 0 for those of the object's usual bin less a margin",
             ),
             "floor": self.declare(
-                "workspace_floor", 0.0, "lower end of that box along world z, metres; 0 for 5 % of the diameter"
+                "workspace_floor",
+                0.0,
+                "lower end of the box in which unexplained surface is looked for, world z in metres; the bin's floor "
+                "should be below; 0 for 5 % of the diameter",
             ),
             "height": self.declare(
-                "workspace_height", 0.0, "its upper end, metres; 0 for one and a half diameters", minimum=0.0
+                "workspace_height",
+                0.0,
+                "upper end of that box, world z in metres; 0 for one and a half diameters",
+                minimum=0.0,
             ),
         }
         self._objects = self.output(PointCloud2, "objects", latched=True)
