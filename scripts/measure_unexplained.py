@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Whether unexplained surface tells of missed objects, on the validation scenes' bank.
 
-Usage: scripts/measure_unexplained.py OBJECT
+Usage: scripts/measure_unexplained.py OBJECT [--within FRACTION]
 """
 
 import argparse
@@ -11,6 +11,7 @@ import numpy as np
 from active6d_agent.bank import find_bank, load_bank
 from active6d_agent.lookup import BankLookup
 from active6d_core.metrics import DETECTION_FRACTION
+from active6d_perception.fusion import FusionParameters
 from active6d_perception.surface import explainer
 from active6d_sim.scene_store import find_scene
 
@@ -23,9 +24,12 @@ LEAST_CELLS, LEAST_VISIBLE = 3, 0.1
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("object")
-    name = parser.parse_args().object
-    lookup = BankLookup(load_bank(find_bank(name, "val")))
-    near = explainer(lookup.model, lookup.parameters.explained_within)
+    within = FusionParameters.explained_within
+    parser.add_argument("--within", type=float, default=within, help="what an object explains, in diameters")
+    arguments = parser.parse_args()
+    name = arguments.object
+    lookup = BankLookup(load_bank(find_bank(name, "val")), FusionParameters(explained_within=arguments.within))
+    near = explainer(lookup.model, within)
     limit, rng = DETECTION_FRACTION * lookup.model.diameter, np.random.default_rng(0)
     told, without, cells = [], [], []
     for index, bank_scene in enumerate(lookup.bank.scenes):
