@@ -61,6 +61,18 @@ def test_cells_are_seen_where_three_points_lie(render, view, scale, stride):
     assert 10 < seen.sum() < (counts > 0).sum()
 
 
+def test_a_camera_within_or_turned_away_from_the_box():
+    """No part of the image can be left out, or all of it."""
+    grid, camera = SurfaceGrid((0.8, 0.8), -0.4, 0.4, 0.1), DEFAULT_CAMERA.scaled(0.1)
+    depth = np.random.default_rng(0).uniform(0.1, 0.6, (camera.height, camera.width))
+    T_world_camera = make_transform(Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix(), [0.1, 0.0, -0.1])
+    seen = grid.observe(depth, camera, T_world_camera)
+    np.testing.assert_array_equal(seen, count_points(grid, depth, camera, T_world_camera, 1) >= 3)
+    assert seen.sum() > 20
+    T_world_camera[0, 3] = 1.5  # the box is to the left of the image now
+    assert not grid.observe(depth, camera, T_world_camera).any()
+
+
 def test_centres_are_numbered_as_cells_are():
     grid = SurfaceGrid((0.3, 0.2), 0.01, 0.11, 0.05)
     assert grid.shape == (6, 4, 2)

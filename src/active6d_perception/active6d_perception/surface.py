@@ -7,11 +7,12 @@ that a view is a row of bits, a scene the union of its views, and a bank of view
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import product
 
 import numpy as np
 import open3d as o3d
 
-from active6d_core.camera import PinholeCamera, pixel_rays
+from active6d_core.camera import PinholeCamera, pixel_rays, project
 from active6d_core.object_model import ObjectModel
 
 # Images are thinned to about this focal length in pixels (every second pixel each way of a VGA image), so that what is
@@ -96,22 +97,38 @@ class SurfaceGrid:
         """
         if depth.shape != (camera.height, camera.width):
             raise ValueError(f"depth image is {depth.shape}, the camera's are {(camera.height, camera.width)}")
-        stride = _stride(camera)
-        z = depth[::stride, ::stride].ravel()
-        R, t = T_world_camera[:3, :3] / self.cell, (T_world_camera[:3, 3] - self.low) / self.cell
-        index = R.astype(np.float32) @ _rays(camera) * z + t.astype(np.float32)[:, None]
-        inside = np.ones(len(z), bool)
-        for along, count in zip(index, self.shape, strict=True):
-            inside &= (along >= 0) & (along < count)  # false for NaN
-        cells = np.ravel_multi_index(index[:, inside].astype(np.intp), self.shape)
-        return np.bincount(cells, minlength=len(self)) >= _LEAST_POINTS
+        stride, (rows, columns) = _stride(camera), self._window(camera, T_world_camera)
+        z = depth[::stride, ::stride][rows, columns].ravel()
+        rays = _rays(camera)[:, rows, columns].reshape(3, -1)
+        along = (T_world_camera[:3, :3] / self.cell).astype(np.float32) @ rays * z
+        # One more layer of cells on every side takes what lies outside, and depth that is missing.
+        along += ((T_world_camera[:3, 3:] - self.low[:, None]) / self.cell + 1.0).astype(np.float32)
+        padded = tuple(count + 2 for count in self.shape)
+        cells = np.zeros(len(z), np.intp)
+        for index, count in zip(along, padded, strict=True):
+            cells *= count
+            cells += np.fmin(np.fmax(index, 0), count - 1).astype(np.intp)
+        counts = np.bincount(cells, minlength=int(np.prod(padded))).reshape(padded)
+        return (counts[1:-1, 1:-1, 1:-1] >= _LEAST_POINTS).ravel()
+
+    def _window(self, camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[slice, slice]:
+        """Rows and columns of the thinned image that the box can appear in: all where it reaches behind the camera."""
+        corners = self.low + np.array(list(product((0, 1), repeat=3))) * self.shape * self.cell
+        corners = (corners - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        if corners[:, 2].min() <= 0:
+            return slice(None), slice(None)
+        stride, pixels = _stride(camera), project(corners, camera)
+        # A pixel of margin for rounding.
+        low = np.maximum(np.floor(pixels.min(axis=0) / stride) - 1, 0).astype(int)
+        high = np.maximum(np.ceil(pixels.max(axis=0) / stride) + 2, 0).astype(int)
+        return slice(low[1], high[1]), slice(low[0], high[0])
 
 
 @lru_cache(maxsize=4)
 def _rays(camera: PinholeCamera) -> np.ndarray:
-    """(3, n) rays with z = 1 through the pixels that are looked at."""
+    """(3, h, w) rays with z = 1 through the pixels of the thinned image."""
     stride = _stride(camera)
-    return np.ascontiguousarray(pixel_rays(camera)[::stride, ::stride].reshape(-1, 3).T)
+    return np.ascontiguousarray(np.moveaxis(pixel_rays(camera)[::stride, ::stride], -1, 0))
 
 
 def _stride(camera: PinholeCamera) -> int:
@@ -132,7 +149,7 @@ class Explainer:
         reach = within * model.diameter
         low, high = model.mesh.bounds + [[-reach - self._voxel], [reach + self._voxel]]
         shape = np.ceil((high - low) / self._voxel).astype(int) + 1
-        self._low, self._shape = low, shape
+        self._low = low
         scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         mesh = model.mesh
         scene.add_triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
@@ -144,13 +161,15 @@ class Explainer:
 
     def explains(self, points: np.ndarray, T_world_object: np.ndarray) -> np.ndarray:
         """Whether each of (k, 3) points in the world is near the surface of each of (n, 4, 4) poses: (n, k) bool."""
-        R = np.swapaxes(T_world_object[:, :3, :3], 1, 2) / self._voxel
-        offset = -R @ T_world_object[:, :3, 3:] - self._low[:, None] / self._voxel
-        index = (R.reshape(-1, 3) @ points.T).reshape(len(R), 3, len(points))
-        index += offset
-        np.clip(index, 0, (self._shape - 1)[:, None], out=index)
-        x, y, z = np.moveaxis(index.astype(np.int32), 1, 0)
-        return self._near.ravel().take((x * self._shape[1] + y) * self._shape[2] + z)
+        R, t = T_world_object[:, :3, :3] / self._voxel, T_world_object[:, :3, 3]
+        entry = np.zeros((len(R), len(points)), np.int32)
+        # One axis of the table after the other: several times faster than all coordinates of a point together.
+        for axis, count in enumerate(self._near.shape):
+            along = R[:, :, axis] @ points.T
+            along -= (R[:, :, axis] * t).sum(axis=1, keepdims=True) + self._low[axis] / self._voxel
+            entry *= count
+            entry += np.clip(along, 0, count - 1, out=along).astype(np.int32)
+        return self._near.ravel().take(entry)
 
 
 @lru_cache(maxsize=8)
