@@ -104,11 +104,13 @@ class SurfaceGrid:
         # One more layer of cells on every side takes what lies outside, and depth that is missing.
         along += ((T_world_camera[:3, 3:] - self.low[:, None]) / self.cell + 1.0).astype(np.float32)
         padded = tuple(count + 2 for count in self.shape)
-        cells = np.zeros(len(z), np.intp)
+        np.fmax(along, 0.0, out=along)
+        # Whole numbers of this size are exact in float32, which is faster than integers are.
+        cells = np.zeros(len(z), np.float32)
         for index, count in zip(along, padded, strict=True):
             cells *= count
-            cells += np.fmin(np.fmax(index, 0), count - 1).astype(np.intp)
-        counts = np.bincount(cells, minlength=int(np.prod(padded))).reshape(padded)
+            cells += np.floor(np.minimum(index, count - 1, out=index), out=index)
+        counts = np.bincount(cells.astype(np.intp), minlength=int(np.prod(padded))).reshape(padded)
         return (counts[1:-1, 1:-1, 1:-1] >= _LEAST_POINTS).ravel()
 
     def _window(self, camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[slice, slice]:
