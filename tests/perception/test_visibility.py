@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from active6d_core.object_model import load_object
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.visibility import POINTS, expected_visibility
+from active6d_perception.visibility import Tray, expected_visibility, walled
 
 NAMES = ("mug", "bunny", "coffee_cup")
 
@@ -65,25 +65,48 @@ def test_an_object_alone_is_seen_whole_and_one_right_behind_another_is_not():
     assert shares[1, 0] == 1.0
 
 
-def test_a_patch_is_hidden_where_a_ray_to_it_is():
-    """Point by point, against rays through the same mesh."""
+def test_only_those_that_hide_hide():
+    """What the others would hide is seen; they themselves are hidden as before."""
     model, rng = load_object("mug"), np.random.default_rng(1)
-    T = heap(model, rng, 6)
-    patches = rng.uniform(-0.12, 0.12, (40, 1, 3)) - [0.0, 0.0, 0.12]
-    eyes = ViewSphere().positions[::7]
-    told = expected_visibility(model).shares(T, eyes, np.tile(patches, (1, POINTS, 1)))[len(T) :]
+    T, eyes = heap(model, rng, 6), ViewSphere().positions[::3]
+    visibility = expected_visibility(model)
+    everything, some = visibility.shares(T, eyes), visibility.shares(T, eyes, hiding=4)
+    for index in (4, 5):
+        alone = visibility.shares(T[[0, 1, 2, 3, index]], eyes)
+        np.testing.assert_array_equal(some[index], alone[-1])
+    np.testing.assert_array_equal(some[:4], visibility.shares(T[:4], eyes))
+    assert (some >= everything).all()
+    assert (some > everything).any()
+
+
+def test_walls_hide_what_rays_through_boxes_miss():
+    """Against ray casting of four thin walls, from all sides and levels."""
+    rng, tray = np.random.default_rng(2), Tray(0.3, 0.08)
+    points = rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, 0.12], (30, 3))
+    eyes = ViewSphere().positions
     scene = o3d.t.geometry.RaycastingScene()
-    for pose in T:
-        vertices = model.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
-        scene.add_triangles(vertices.astype(np.float32), np.asarray(model.mesh.faces, np.uint32))
-    rays = np.concatenate(np.broadcast_arrays(patches, eyes - patches), axis=-1).astype(np.float32)
+    for size, centre in [((0.3, 1e-4), (0.0, 0.15)), ((1e-4, 0.3), (0.15, 0.0))]:
+        for sign in (-1, 1):
+            box = o3d.t.geometry.TriangleMesh.create_box(*size, tray.wall_height)
+            corner = [sign * centre[0] - size[0] / 2, sign * centre[1] - size[1] / 2, 0.0]
+            scene.add_triangles(box.translate(o3d.core.Tensor(corner, dtype=o3d.core.float32)))
+    rays = np.concatenate(np.broadcast_arrays(points[:, None], eyes - points[:, None]), axis=-1).astype(np.float32)
     hidden = scene.test_occlusions(o3d.core.Tensor(rays)).numpy()
-    assert 0.2 < hidden.mean() < 0.8
-    assert ((told == 0.0) == hidden).mean() > 0.92
+    starts = np.broadcast_to(points.T[:, :, None, None], (3, 30, 100, 1))
+    told = walled(starts, eyes, tray)[..., 0]
+    assert 0.05 < hidden.mean() < 0.5
+    assert (told == hidden).mean() > 0.999
+    assert not walled(starts, eyes, None).any()
+
+
+def test_a_tray_hides_the_low_from_low_eyes():
+    model = load_object("bunny")
+    T, tray = make_transform(np.eye(3), [0.0, 0.0, 0.03])[None], Tray.for_model(load_object("bunny"))
+    level, above = np.array([[0.8, 0.0, 0.05], [0.0, 0.01, 0.8]])
+    shares = expected_visibility(model).shares(T, np.stack([level, above]), tray)
+    np.testing.assert_array_equal(shares, [[0.0, 1.0]])
 
 
 def test_nothing_is_seen_of_nothing():
-    model, eyes = load_object("bunny"), ViewSphere().positions
-    shares = expected_visibility(model).shares(np.zeros((0, 4, 4)), eyes, np.zeros((2, POINTS, 3)))
-    np.testing.assert_array_equal(shares, np.ones((2, 100)))
-    assert expected_visibility(model).shares(np.zeros((0, 4, 4)), eyes).shape == (0, 100)
+    eyes = ViewSphere().positions
+    assert expected_visibility(load_object("bunny")).shares(np.zeros((0, 4, 4)), eyes).shape == (0, 100)

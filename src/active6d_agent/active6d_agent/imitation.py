@@ -20,17 +20,17 @@ from active6d_agent.evaluation import MEASURES, all_starts, measure, observe, ru
 from active6d_agent.lookup import BankLookup
 from active6d_agent.oracle import known
 from active6d_agent.policy import Observation
+from active6d_agent.scene_state import MAX_OBJECTS, SceneState, gather, represent
 from active6d_agent.view_attention import (
     GAINS,
-    MAX_OBJECTS,
     ViewAttention,
     Weighing,
-    encode,
     load_network,
     new_network,
     save_network,
     value_views,
 )
+from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 
 # Episodes that the network values together: more are no faster and need memory.
@@ -40,6 +40,10 @@ _MEAN_DECAY = 0.995
 # What is tried for the weighing.
 _LOOKAHEADS = (0.0, 0.25, 0.5, 1.0)
 _METRES_WEIGHTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+# A patch is surface of a true object whose middle is within this fraction of the diameter.
+_PATCH_REACH = 0.75
+# Of the loss about all gains to the end, against that about the next view's.
+_LATER_WEIGHT = 0.1
 # Variance over a state's views, in objects squared, that counts as none.
 _VARIANCE_FLOOR = 0.1
 
@@ -71,9 +75,9 @@ class ImitationParameters:
 
     steps: int = 5
     longest: int = 8
-    rounds: int = 40
+    rounds: int = 30
     episodes: int = 32
-    updates: int = 50
+    updates: int = 100
     batch: int = 96
     views: int = 32
     learning_rate: float = 2e-3
@@ -123,12 +127,12 @@ class Example:
     """One state and what its views gain.
 
     Attributes:
-        observation: the state.
+        state: what was known.
         now: (M, n + 1, 2) :func:`candidate_gains`.
         later: (M, n + 1, 2) likewise.
     """
 
-    observation: Observation
+    state: SceneState
     now: np.ndarray
     later: np.ndarray
 
@@ -223,20 +227,26 @@ def validate(network: ViewAttention, lookup: BankLookup, starts: np.ndarray, ste
     """Detection rate, e_ADD (mm) and metres of the network's moves from (E, 2) starts."""
     views = np.full((len(starts), steps + 1), -1)
     views[:, 0] = starts[:, 1]
-    played = roll_out(lookup, greedy(network), starts[:, 0], views, np.full(len(starts), steps))
+    played = roll_out(lookup, greedy(network, lookup.model), starts[:, 0], views, np.full(len(starts), steps))
     result = measure(lookup, starts[:, 0], played)
     return float(result.detection_rate.mean()), float(result.e_add_mm.mean()), float(result.distance_m.mean())
 
 
-def greedy(network: ViewAttention) -> Callable[[list[Observation]], np.ndarray]:
+def greedy(network: ViewAttention, model: ObjectModel) -> Callable[[list[Observation]], np.ndarray]:
     """Observations to (B,) views of most worth."""
-    return lambda observations: _worths(network, observations).argmax(axis=1)
+
+    def choose(observations: list[Observation]) -> np.ndarray:
+        states = [represent(each, model) for each in observations]
+        return _worths(network, observations, states).argmax(axis=1)
+
+    return choose
 
 
-def _worths(network: ViewAttention, observations: list[Observation]) -> np.ndarray:
+def _worths(network: ViewAttention, observations: list[Observation], states: list[SceneState]) -> np.ndarray:
     """(B, M) worth of every view by what the network weighs."""
-    parts = [observations[start : start + _TOGETHER] for start in range(0, len(observations), _TOGETHER)]
-    return np.concatenate([value_views(network, part, network.weighing).worth for part in parts])
+    parts = [slice(start, start + _TOGETHER) for start in range(0, len(observations), _TOGETHER)]
+    values = [value_views(network, observations[part], states[part], network.weighing) for part in parts]
+    return np.concatenate([each.worth for each in values])
 
 
 def roll_out(
@@ -278,13 +288,16 @@ def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
     return paths
 
 
-def candidate_gains(lookup: BankLookup, scene: int, views: np.ndarray, left: int) -> tuple[np.ndarray, np.ndarray]:
+def candidate_gains(
+    lookup: BankLookup, scene: int, views: np.ndarray, left: int, patches: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """What each view adds to the (v,) views taken, and what :func:`spread` adds in the moves that are left after it.
 
     Returns:
         Twice (M, n + 1, 2), NaN for views taken: gains (:func:`~active6d_agent.oracle.known`) of the true objects that
-        the n accumulated ones are best for, in the order of :func:`~active6d_agent.view_attention.best_verified`; of
-        several for one true object the best has the gain. Last, what all true objects gain that none stands for.
+        the n items stand for, which are the accumulated objects in the order of
+        :func:`~active6d_agent.scene_state.best_verified` and the (m, 3) middles ``patches``; of several for one true
+        object the first has the gain. Last, what all true objects gain that none stands for.
     """
     free = np.setdiff1d(np.arange(len(lookup.sphere)), views)
     paths = np.column_stack([np.tile(views, (len(free), 1)), free])
@@ -292,18 +305,36 @@ def candidate_gains(lookup: BankLookup, scene: int, views: np.ndarray, left: int
     after, ended = (
         known(lookup, np.full(len(free), scene), each) for each in (paths, spread(lookup.sphere, paths, left - 1))
     )
+    column, stands_for = _stand_for(lookup, scene, views, patches)
+    rows = lookup.fuse(np.array([scene]), views[None], views[-1:]).objects[0]
+    count = min(len(rows), MAX_OBJECTS) + len(patches)
+    gains = np.full((2, len(lookup.sphere), count + 1, GAINS), np.nan)
+    gains[:, free] = 0.0
+    for part, added in zip(gains, (after - before, ended - after), strict=True):
+        part[free[:, None], column] = added[:, stands_for]
+        part[free, -1] = added.sum(axis=1) - added[:, stands_for].sum(axis=1)
+    return gains[0], gains[1]
+
+
+def _stand_for(lookup: BankLookup, scene: int, views: np.ndarray, patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Items that stand for true objects, and those objects: an accumulated object for the one that it is best for, a
+    patch for the nearest that no accumulated object stands for."""
     rows = lookup.fuse(np.array([scene]), views[None], views[-1:]).objects[0]
     order = np.argsort(-lookup.verification[rows], kind="stable")
     stands_for, best = np.unique(lookup.nearest_object[rows], return_index=True)
     column = np.argsort(order)[best]
     told = column < MAX_OBJECTS
     stands_for, column = stands_for[told], column[told]
-    gains = np.full((2, len(lookup.sphere), min(len(rows), MAX_OBJECTS) + 1, GAINS), np.nan)
-    gains[:, free] = 0.0
-    for part, added in zip(gains, (after - before, ended - after), strict=True):
-        part[free[:, None], column] = added[:, stands_for]
-        part[free, -1] = added.sum(axis=1) - added[:, stands_for].sum(axis=1)
-    return gains[0], gains[1]
+    true = lookup.bank.scenes[scene].T_world_object[:, :3, 3]
+    apart = np.linalg.norm(patches[:, None] - true, axis=-1)
+    apart[:, stands_for] = np.inf
+    for patch, distances in enumerate(apart):
+        nearest = int(distances.argmin())
+        if distances[nearest] < _PATCH_REACH * lookup.model.diameter:
+            stands_for = np.append(stands_for, nearest)
+            column = np.append(column, min(len(rows), MAX_OBJECTS) + patch)
+            apart[:, nearest] = np.inf
+    return column, stands_for
 
 
 class _Learner:
@@ -357,10 +388,14 @@ class _Learner:
 
         def choose(observations: list[Observation]) -> np.ndarray:
             running = np.flatnonzero(left > 0)
-            values = _worths(self.network, observations)
-            states = zip(scene[running], views[running], left[running], strict=True)
-            gains = [candidate_gains(lookup, index, taken[taken >= 0], moves) for index, taken, moves in states]
-            self.memory.extend(Example(seen, *both) for seen, both in zip(observations, gains, strict=True))
+            states = [represent(each, lookup.model) for each in observations]
+            values = _worths(self.network, observations, states)
+            visited = zip(scene[running], views[running], left[running], states, strict=True)
+            gains = [
+                candidate_gains(lookup, index, taken[taken >= 0], moves, state.patches)
+                for index, taken, moves, state in visited
+            ]
+            self.memory.extend(Example(state, *both) for state, both in zip(states, gains, strict=True))
             self.states += len(observations)
             truths = [(now + later).sum(axis=1) @ [1.0, self._weighing.error_weight] for now, later in gains]
             best = [self._best(truth, worth, lead) for truth, worth in zip(truths, values, strict=True)]
@@ -378,15 +413,15 @@ class _Learner:
 
     def _update(self) -> float:
         drawn = [self.memory[i] for i in self.rng.integers(len(self.memory), size=self.parameters.batch)]
-        state = encode([example.observation for example in drawn])
+        state = gather([example.state for example in drawn])
         some = self.rng.permutation(len(self.lookup.sphere))[: self.parameters.views]
-        state["views"] = state["views"][some]
+        state["views"], state["shown"] = state["views"][some], state["shown"][..., some]
         nows, laters = self._trained.explain(state)
         now = _labels([example.now for example in drawn], some, nows.shape[2])
         later = _labels([example.later for example in drawn], some, nows.shape[2])
-        # What comes first is learned by itself, too: it is surer than the sum, which decides.
+        # What comes next decides more than what may come after it, and is surer.
         weight = self.parameters.object_weight
-        loss = _loss(nows, now, weight) + _loss(nows + laters, now + later, weight)
+        loss = _loss(nows, now, weight) + _LATER_WEIGHT * _loss(nows + laters, now + later, weight)
         self.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self._trained.parameters(), 1.0)

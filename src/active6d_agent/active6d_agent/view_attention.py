@@ -1,10 +1,10 @@
 """A policy that scores every view against the set of all objects: ``view-attention`` in the registry.
 
 A Gaussian over two angles cannot say "either of these two gaps". Here every view of the grid is valued by itself:
-it looks at all accumulated objects (cross-attention) through what a robot knows of each pair, which is geometry
-between poses: how free the line of sight is past the other objects, from which side of the object it comes, how new
-that side is after the views already taken. Everything is relative, so turning the world about the vertical axis turns
-the answer with it; the order and the number of objects do not matter.
+it looks at all accumulated objects (cross-attention), and at the surface that none of them explains, through what a
+robot knows of each pair: how much of the object the view would show past the others and the bin's walls, from which
+side of the object it comes, how new that side is after the views already taken. The order and the number of objects do
+not matter.
 
 The network predicts what a view gains at once and what can still be gained after it. Training is in
 :mod:`active6d_agent.imitation`.
@@ -23,20 +23,18 @@ import torch
 from torch import nn
 
 from active6d_agent.policy import Decision, Observation, register_policy, weights_path
+from active6d_agent.scene_state import SceneState, best_verified, gather, represent
 from active6d_agent.weights_file import load_weights, save_weights
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.visibility import Tray
 
-#: Objects beyond these are left out, the best verified being kept.
-MAX_OBJECTS = 64
 #: Gains are told as objects newly detected, and as the fall of the summed e_ADD over 50 mm.
 GAINS = 2
-_OBJECT_FEATURES = 14
+_OBJECT_FEATURES = 17
 _PAIR_FEATURES = 12
 _VIEW_FEATURES = 8
-# A hypothesis closer than this fraction of the diameter is the same object, so it hides nothing.
-_SAME_OBJECT = 0.25
 
 
 @dataclass(frozen=True)
@@ -62,45 +60,6 @@ class Weighing:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be finite and not negative")
         if not 0 <= self.lookahead <= 1:
             raise ValueError(f"lookahead is {self.lookahead}, must be in [0, 1]")
-
-
-def best_verified(observation: Observation) -> np.ndarray:
-    """Indices of the objects that are looked at: all, or of many the best verified."""
-    return np.argsort(-observation.objects.verification, kind="stable")[:MAX_OBJECTS]
-
-
-def encode(observations: Sequence[Observation]) -> dict[str, torch.Tensor]:
-    """Padded tensors of B observations on one grid.
-
-    Returns:
-        ``pose`` (B, n, 3, 4) objects in the world, ``scalars`` (B, n, 4) verification, score, spread in metres and
-        share of the views that support the object, ``present`` (B, n), ``taken`` (B, t, 3) positions so far, at the end
-        the current one, repeated, ``moves`` (B,) moves made, ``left`` (B,) moves left, ``views`` (M, 3).
-    """
-    count = max(1, max(min(len(each.objects), MAX_OBJECTS) for each in observations))
-    longest = max(len(each.positions) for each in observations)
-    B = len(observations)
-    pose, scalars = np.zeros((B, count, 3, 4), np.float32), np.zeros((B, count, 4), np.float32)
-    present, taken = np.zeros((B, count), bool), np.zeros((B, longest, 3), np.float32)
-    for row, each in enumerate(observations):
-        objects, t = each.objects, len(each.positions)
-        n = min(len(objects), MAX_OBJECTS)
-        best = best_verified(each)
-        pose[row, :n] = objects.T_world_object[best, :3]
-        columns = (objects.verification, objects.score, objects.spread, objects.support / t)
-        scalars[row, :n] = np.column_stack(columns)[best]
-        present[row, :n] = True
-        taken[row, :t], taken[row, t:] = each.positions, each.positions[-1]
-    arrays = {
-        "pose": pose,
-        "scalars": scalars,
-        "present": present,
-        "taken": taken,
-        "moves": np.array([len(each.positions) - 1 for each in observations], np.float32),
-        "left": np.array([each.steps_left for each in observations], np.float32),
-        "views": observations[0].sphere.positions.astype(np.float32),
-    }
-    return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 
 class _Seen(NamedTuple):
@@ -150,7 +109,7 @@ class ViewAttention(nn.Module):
         """Value all views.
 
         Args:
-            state: of :func:`encode`.
+            state: of :func:`~active6d_agent.scene_state.gather`.
 
         Returns:
             (B, M, 2) gains of going there next; (B, M, 2) gains of the moves after that, zero where none are left;
@@ -192,9 +151,10 @@ class ViewAttention(nn.Module):
         return _Seen(e, total, whole, attention, mask)
 
     def describe(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What is known of (B, n, 14) objects, (B, M, n, 12) pairs and (B, M, 8) views; none of it names a direction
-        of the world but the vertical."""
-        pose, present, taken, grid = state["pose"], state["present"], state["taken"], state["views"]
+        """What is known of (B, n, 17) objects and patches, (B, M, n, 12) pairs and (B, M, 8) views; none of it names a
+        direction of the world but the vertical."""
+        pose, taken, grid = state["pose"], state["taken"], state["views"]
+        shown, seen = state["shown"], state["seen"]
         rotation, centre = pose[..., :3], pose[..., 3]
         B, M = pose.shape[0], grid.shape[0]
         radius = torch.linalg.vector_norm(taken, dim=-1, keepdim=True)
@@ -204,43 +164,25 @@ class ViewAttention(nn.Module):
         rays = cameras[:, None] - centre[..., None]
         distance = torch.linalg.vector_norm(rays, dim=2)
         rays /= distance.clamp(min=1e-6)[:, :, None]
-        apart = (centre[:, None] - centre[:, :, None]) / self.diameter
-        square = (apart**2).sum(dim=-1)
-        free, clear = self._sight(rays, apart, square, present)
-        new, seen_then = rays[..., :M], free[..., M:]
+        new = rays[..., :M]
         from_axis = torch.linalg.vector_norm(centre[..., :2], dim=-1)
         outward = centre[..., None, :2] / from_axis.clamp(min=1e-6)[..., None, None]
         turned = rays[..., M:].transpose(2, 3) @ new
         closest = turned.amax(dim=2).clamp_(-1.0, 1.0)
         columns = [
-            free[..., :M],
-            clear[..., :M],
+            shown,
+            shown - seen.amax(dim=2, keepdim=True),
             new[:, :, 2],
             torch.acos(closest * 0.999999) / np.pi,
             closest,
-            (seen_then[..., None] * (1.0 + turned)).amax(dim=2) / 2,
+            (seen[..., None] * (1.0 + turned)).amax(dim=2) / 2,
             distance[..., :M] / radius[:, -1:] - 1.0,
             (outward @ new[:, :, :2])[:, :, 0],
             (new * outlook.T).sum(dim=2) - 0.95,
             *self._sides((rotation.transpose(2, 3) @ new).movedim(2, -1)).unbind(dim=-1),
         ]
         pairs = torch.stack(columns, dim=2).permute(0, 3, 1, 2).contiguous()
-        sights = seen_then.amax(dim=2), clear[..., -1]
-        objects = self._describe_objects(state, apart, square, from_axis, sights)
-        return objects, pairs, self._describe_views(state, outlook, headings)
-
-    def _sight(
-        self, rays: torch.Tensor, apart: torch.Tensor, square: torch.Tensor, present: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """How free (B, n, 3, K) rays from objects to cameras are past the other objects: (B, n, K) twice, once for
-        balls with the diameter and once for their cores."""
-        hides = (square > _SAME_OBJECT**2) & present[:, None]
-        # (B, n, n, K), the object whose sight it is first, then the one that may hide it.
-        along = apart @ rays
-        beside = torch.addcmul(torch.where(hides, square, np.inf)[..., None], along, along, value=-1.0)
-        beside = torch.where(along > 0, beside, 1.0).clamp_(0.0, 1.0)
-        # Roots are drawn of the products, which are fewer.
-        return beside.prod(dim=2).sqrt_(), (4 * beside).clamp_(max=1.0).prod(dim=2).sqrt_()
+        return self._describe_objects(state, from_axis), pairs, self._describe_views(state, outlook, headings)
 
     def _sides(self, directions: torch.Tensor) -> torch.Tensor:
         """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
@@ -249,27 +191,27 @@ class ViewAttention(nn.Module):
         axial = directions @ self._axis
         return torch.stack([axial, (1 - axial**2).clamp(min=0.0).sqrt(), torch.zeros_like(axial)], dim=-1)
 
-    def _describe_objects(
-        self,
-        state: dict[str, torch.Tensor],
-        apart: torch.Tensor,
-        square: torch.Tensor,
-        from_axis: torch.Tensor,
-        sights: tuple[torch.Tensor, torch.Tensor],
-    ) -> torch.Tensor:
-        pose, present = state["pose"], state["present"]
-        verification, score, spread, support = state["scalars"].unbind(dim=-1)
-        near = torch.exp(-square) * present[:, None]
+    def _describe_objects(self, state: dict[str, torch.Tensor], from_axis: torch.Tensor) -> torch.Tensor:
+        pose, seen = state["pose"], state["seen"]
+        # The last view is repeated where others have more.
+        own = seen * (torch.arange(seen.shape[2]) <= state["moves"][:, None])[:, None]
+        apart = (pose[:, None, :, :, 3] - pose[:, :, None, :, 3]) / self.diameter
+        near = torch.exp(-(apart**2).sum(dim=-1)) * state["present"][:, None]
+        verification, score, spread, support, patch, size = state["scalars"].unbind(dim=-1)
         columns = [
             verification,
             score,
             (spread / self.diameter).clamp_(max=1.0),
             support,
+            patch,
+            size,
             pose[..., 2, 3] / self.diameter,
             from_axis / (2 * self.diameter),
             near.sum(dim=-1) / 3,
             (near * apart[..., 2].clamp(min=0.0)).sum(dim=-1),
-            *sights,
+            seen.amax(dim=2),
+            seen[..., -1],
+            own.sum(dim=2) / 3,
             (state["moves"] / 5).clamp_(max=2.0)[:, None].expand_as(score),
             *self._sides(pose[..., 2, :3]).unbind(dim=-1),
         ]
@@ -326,7 +268,7 @@ class ViewValues:
     Attributes:
         worth: (B, M) of going to each view next, ``-inf`` where it is no candidate.
         gain: (B, M) expected of it and all later moves, ``-inf`` likewise.
-        attention: (B, M, n) of each view to the objects that :func:`encode` keeps.
+        attention: (B, M, n) of each view to the objects and patches.
     """
 
     worth: np.ndarray
@@ -334,10 +276,12 @@ class ViewValues:
     attention: np.ndarray
 
 
-def value_views(network: nn.Module, observations: Sequence[Observation], weighing: Weighing) -> ViewValues:
-    """Value every view of every observation."""
+def value_views(
+    network: nn.Module, observations: Sequence[Observation], states: Sequence[SceneState], weighing: Weighing
+) -> ViewValues:
+    """Value every view of every observation, given its :func:`~active6d_agent.scene_state.represent`."""
     with torch.inference_mode():
-        now, later, attention = (values.double().numpy() for values in network(encode(observations)))
+        now, later, attention = (values.double().numpy() for values in network(gather(states)))
     candidates = np.stack([each.candidates() for each in observations])
     arcs = np.stack([each.sphere.arc(each.sphere.positions, each.positions[-1]) for each in observations])
     weigh = np.array([1.0, weighing.error_weight])
@@ -347,11 +291,11 @@ def value_views(network: nn.Module, observations: Sequence[Observation], weighin
     return ViewValues(worth, np.where(candidates, (now + later) @ weigh, -np.inf), attention)
 
 
-def trace(network: ViewAttention) -> nn.Module:
+def trace(network: ViewAttention, model: ObjectModel) -> nn.Module:
     """The same network without Python between its many small operations, for observations of any size."""
     sphere = ViewSphere()
     nothing = Observation(SceneObjects.empty(), sphere.positions[:1], sphere, np.ones(len(sphere), bool), 1)
-    state = encode([nothing])
+    state = gather([represent(nothing, model)])
     with torch.inference_mode(), warnings.catch_warnings():
         # torch calls tracing deprecated, but what shall replace it needs a compiler on the robot.
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -363,11 +307,11 @@ def trace(network: ViewAttention) -> nn.Module:
 
 
 @lru_cache(maxsize=8)
-def _deployed(path: Path, object_name: str, written: int) -> tuple[nn.Module, Weighing]:
+def _deployed(path: Path, model: ObjectModel, written: int) -> tuple[nn.Module, Weighing]:
     """The traced network of a file as it was ``written`` (ns), and its weighing; an evaluation makes hundreds of
     policies, which share one."""
-    network = load_network(path, object_name)
-    return trace(network), network.weighing
+    network = load_network(path, model.name)
+    return trace(network, model), network.weighing
 
 
 @contextmanager
@@ -394,6 +338,8 @@ class ViewAttentionPolicy:
         error_weight: likewise.
         lookahead: likewise.
         stop_below: stop when this and all later moves are expected to gain less than this many objects; 0 never does.
+        bin_width: between the bin's inner walls, metres; by default that of the object's usual bin, as the next.
+        wall_height: of those walls above the floor, metres; 0 for an open table.
 
     Raises:
         ValueError: there are no usable weights, or a number is out of range.
@@ -407,14 +353,21 @@ class ViewAttentionPolicy:
         error_weight: float | None = None,
         lookahead: float | None = None,
         stop_below: float = 0.0,
+        bin_width: float | None = None,
+        wall_height: float | None = None,
     ) -> None:
         path = Path(weights) if weights else weights_path("view-attention", model.name)
         written = path.stat().st_mtime_ns if path.is_file() else 0
-        self._network, weighing = _deployed(path, model.name, written)
+        self._network, weighing = _deployed(path, model, written)
         given = {"metres_weight": metres_weight, "error_weight": error_weight, "lookahead": lookahead}
         given = {name: value for name, value in given.items() if value is not None}
-        self._weighing = replace(weighing, **given)
+        self._model, self._weighing = model, replace(weighing, **given)
         self._stop_below = stop_below
+        measured = {"width": bin_width, "wall_height": wall_height}
+        measured = {name: value for name, value in measured.items() if value is not None}
+        self._tray = Tray.for_model(model)._replace(**measured)
+        if not (0 < self._tray.width < np.inf and 0 <= self._tray.wall_height < np.inf):
+            raise ValueError(f"bin_width must be positive and wall_height not negative, got {self._tray}")
 
     def reset(self, rng: np.random.Generator) -> None:
         """Nothing is random here."""
@@ -422,14 +375,15 @@ class ViewAttentionPolicy:
     def decide(self, observation: Observation) -> Decision:
         """The view of most worth, and the object that it attends to."""
         with _one_thread():
-            values = value_views(self._network, [observation], self._weighing)
+            state = represent(observation, self._model, self._tray)
+            values = value_views(self._network, [observation], [state], self._weighing)
         most = values.gain[0].max()
         if most == -np.inf or (self._stop_below > 0 and most < self._stop_below):
             return Decision.stop_here(observation)
         view = int(values.worth[0].argmax())
-        n = len(observation.objects)
-        if n == 0:
+        attention = np.zeros(len(observation.objects))
+        best = best_verified(observation)
+        attention[best] = values.attention[0, view, : len(best)]
+        if not attention.any():  # all of it is on surface that no object explains
             return Decision.go_to(observation, view)
-        attention = np.zeros(n)
-        attention[best_verified(observation)] = values.attention[0, view]
         return Decision.go_to(observation, view, attention / attention.sum(), int(attention.argmax()))

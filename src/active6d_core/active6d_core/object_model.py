@@ -86,6 +86,11 @@ class ObjectModel:
         """
         return round(0.625 * self.diameter * float(np.sqrt(np.mean(self.instances))), 2)
 
+    @property
+    def wall_height(self) -> float:
+        """Height of that bin's inner walls, metres."""
+        return round(0.6 * self.diameter, 3)
+
     def feature_mask(self, feature: str, points: np.ndarray) -> np.ndarray:
         """Which of (n, 3) ``points`` in the object frame belong to the named part: (n,) bool."""
         low, high = self.features[feature]

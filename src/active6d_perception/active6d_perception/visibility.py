@@ -17,10 +17,10 @@ from active6d_core.object_model import ObjectModel
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 directions
 _PIXELS = 24  # across a silhouette
-#: Points of an object, and of a patch, that are looked for.
-POINTS = 10
+# Points of an object that are looked for.
+_POINTS = 10
 # Farther off the ray than this, in reaches of the model from its origin, no object hides much of another.
-_SIDEWAYS = 1.6
+_SIDEWAYS = 1.5
 # Nothing closer in front of a point than this fraction of the diameter hides it: poses are not exact.
 _CLEARANCE = 0.02
 
@@ -31,7 +31,34 @@ def expected_visibility(model: ObjectModel) -> "ExpectedVisibility":
     return ExpectedVisibility(model)
 
 
-class _Hiders(NamedTuple):
+class Tray(NamedTuple):
+    """Walls around the world's origin, metres."""
+
+    width: float
+    """between the inner walls, along world x and y"""
+    wall_height: float
+    """above the floor at z = 0"""
+
+    @classmethod
+    def for_model(cls, model: ObjectModel) -> "Tray":
+        """The bin that an object's heap usually lies in."""
+        return cls(model.bin_width, model.wall_height)
+
+
+def walled(points: np.ndarray, eyes: np.ndarray, tray: Tray | None) -> np.ndarray:
+    """(k, V, p) bool, whether the rays from (3, k, V, p) points to (V, 3) eyes leave the tray through a wall."""
+    if tray is None:
+        return np.zeros(points.shape[1:], bool)
+    x, y, z = eyes.T[:, None, :, None] - points
+    # Along the ray, from 0 at the point to 1 at the eye.
+    leaves = [
+        (0.5 * tray.width - np.copysign(1.0, ray) * start) / np.maximum(np.abs(ray), 1e-9)
+        for ray, start in ((x, points[0]), (y, points[1]))
+    ]
+    return points[2] + np.minimum(*leaves) * z < tray.wall_height
+
+
+class _Stand(NamedTuple):
     """Objects as V eyes see them."""
 
     centres: np.ndarray
@@ -47,7 +74,7 @@ class _Hiders(NamedTuple):
 
 
 class ExpectedVisibility:
-    """Shares of posed objects, and of patches of surface, that views would see past the other objects.
+    """Shares of posed objects that views would see past the other objects.
 
     Args:
         model: the object that all poses are of.
@@ -67,7 +94,9 @@ class ExpectedVisibility:
         self._right = right.astype(np.float32)
         # (m, pixels, pixels): how far towards the eye the surface comes, -inf beside the silhouette.
         self._front = front.astype(np.float32)
-        self._points = np.stack([self._spread_points(*pair) for pair in zip(frames, front, strict=True)])
+        # (3, m, p): points of each direction's outline, in the object's frame.
+        points = [self._spread_points(*pair) for pair in zip(frames, front, strict=True)]
+        self._points = np.ascontiguousarray(np.moveaxis(points, -1, 0))
 
     def _look_from(self, mesh: trimesh.Trimesh, frames: np.ndarray) -> np.ndarray:
         scene = o3d.t.geometry.RaycastingScene()
@@ -85,38 +114,37 @@ class ExpectedVisibility:
     def _spread_points(self, frame: np.ndarray, front: np.ndarray) -> np.ndarray:
         """(p, 3) points of the visible surface, spread evenly over the silhouette, object frame."""
         pixels = np.argwhere(np.isfinite(front))
-        centres = kmeans2(pixels.astype(float), POINTS, minit="++", seed=0)[0]
+        centres = kmeans2(pixels.astype(float), _POINTS, minit="++", seed=0)[0]
         row, column = pixels[((pixels[:, None] - centres) ** 2).sum(axis=-1).argmin(axis=0)].T
         seen = np.column_stack([self._pixel_centres[row], self._pixel_centres[column], front[row, column]])
         return (seen @ frame).astype(np.float32)
 
-    def shares(self, T_world_object: np.ndarray, eyes: np.ndarray, patches: np.ndarray | None = None) -> np.ndarray:
-        """What the eyes would see of the objects, and of patches of surface that belong to none of them.
+    def shares(
+        self, T_world_object: np.ndarray, eyes: np.ndarray, tray: Tray | None = None, hiding: int | None = None
+    ) -> np.ndarray:
+        """What the eyes would see of the objects.
 
         Args:
             T_world_object: (n, 4, 4), world, metres.
             eyes: (V, 3) positions of cameras, world, metres, outside the objects.
-            patches: (k, POINTS, 3) points of k patches, world, metres.
+            tray: that all of it lies in, None for an open table.
+            hiding: only the first so many objects hide others, all when None.
 
         Returns:
-            (n + k, V) in [0, 1]: share of each object's silhouette, and of each patch's points, that no other object
-            hides. Walls are not known here, nor is what else may stand in between.
+            (n, V) in [0, 1]: share of each object's silhouette that no other object and no wall hides.
         """
-        hiders = self._stand(T_world_object, np.asarray(eyes, np.float32))
-        R = T_world_object[:, :3, :3].astype(np.float32)
-        own = self._points[hiders.nearest].reshape(len(R), len(eyes) * POINTS, 3) @ R.transpose(0, 2, 1)
-        own = own.reshape(*hiders.nearest.shape, POINTS, 3) + hiders.centres[:, None, None]
-        if patches is None or not len(patches):
-            return self._unhidden(own, hiders.centres, hiders.rays, hiders)
-        patches = np.asarray(patches, np.float32)
-        middles = patches.mean(axis=1)
-        rays = np.asarray(eyes, np.float32) - middles[:, None]
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        everywhere = np.broadcast_to(patches[:, None], (len(patches), len(eyes), *patches.shape[1:]))
-        pairs = (own, everywhere), (hiders.centres, middles), (hiders.rays, rays)
-        return self._unhidden(*(np.concatenate(pair) for pair in pairs), hiders)
+        eyes = np.asarray(eyes, np.float32)
+        stand = self._stand(T_world_object, eyes)
+        n, V = stand.nearest.shape
+        points = self._points[:, stand.nearest].transpose(1, 0, 2, 3).reshape(n, 3, V * _POINTS)
+        points = T_world_object[:, :3, :3].astype(np.float32) @ points + stand.centres[..., None]
+        # Coordinates first, so that each is one long row.
+        points = np.ascontiguousarray(points.transpose(1, 0, 2)).reshape(3, n, V, _POINTS)
+        hidden = walled(points, eyes, tray)
+        self._hide(hidden, points, stand, n if hiding is None else hiding)
+        return 1.0 - hidden.mean(axis=-1)
 
-    def _stand(self, T_world_object: np.ndarray, eyes: np.ndarray) -> "_Hiders":
+    def _stand(self, T_world_object: np.ndarray, eyes: np.ndarray) -> "_Stand":
         R = T_world_object[:, :3, :3].astype(np.float32)
         centres = T_world_object[:, :3, 3].astype(np.float32)
         rays = eyes - centres[:, None]
@@ -128,32 +156,28 @@ class ExpectedVisibility:
         right = self._right[nearest] @ R.transpose(0, 2, 1)
         right -= (right * rays).sum(axis=-1, keepdims=True) * rays
         right /= np.linalg.norm(right, axis=-1, keepdims=True)
-        return _Hiders(centres, rays, distance, right, nearest)
+        return _Stand(centres, rays, distance, right, nearest)
 
-    def _unhidden(self, points: np.ndarray, middles: np.ndarray, rays: np.ndarray, hiders: "_Hiders") -> np.ndarray:
-        """(k, V) share of (k, V, p, 3) points, about (k, 3) middles with (k, V, 3) rays to the eyes, that no object
-        hides; the first are the objects' own, which do not hide them."""
-        k, V, p = points.shape[:3]
-        apart = hiders.centres - middles[:, None]
-        along = apart @ rays.transpose(0, 2, 1)
+    def _hide(self, hidden: np.ndarray, points: np.ndarray, stand: "_Stand", hiding: int) -> None:
+        """Set (n, V, p) ``hidden`` where one of the first ``hiding`` objects hides (3, n, V, p) points of another."""
+        n, V, p = hidden.shape
+        apart = stand.centres[:hiding] - stand.centres[:, None]
+        along = apart @ stand.rays.transpose(0, 2, 1)
         beside = (apart**2).sum(axis=-1)[..., None] - along**2
         may_hide = (along > 0) & (beside < (_SIDEWAYS * self._reach) ** 2)
-        np.einsum("iiv->iv", may_hide[: len(hiders.centres)])[:] = False
-        target, hider, view = np.nonzero(may_hide)
+        target, view, hider = np.nonzero(may_hide.transpose(0, 2, 1))
         pair, image = target * V + view, hider * V + view
-        # Coordinates first, so that each is one long row.
-        x, y, z = np.moveaxis(points.reshape(-1, p, 3)[pair] - hiders.centres[hider][:, None], -1, 0)
-        right, towards = (axes.reshape(-1, 3)[image].T[..., None] for axes in (hiders.right, hiders.rays))
+        x, y, z = points.reshape(3, n * V, p)[:, pair] - stand.centres[hider].T[..., None]
+        right, towards = (axes.reshape(-1, 3)[image].T[..., None] for axes in (stand.right, stand.rays))
         up = np.cross(towards, right, axis=0)
         across, along, nearer = (x * axis[0] + y * axis[1] + z * axis[2] for axis in (right, up, towards))
-        eye = hiders.distance.ravel()[image][:, None]
+        eye = stand.distance.ravel()[image][:, None]
         scale = (_PIXELS / (2 * self._reach)) * eye / (eye - nearer)
         row, column = across * scale + _PIXELS / 2, along * scale + _PIXELS / 2
         inside = (row >= 0) & (row < _PIXELS) & (column >= 0) & (column < _PIXELS)
         pixel = row.astype(np.int32) * _PIXELS + column.astype(np.int32)
-        silhouette = hiders.nearest.ravel()[image][:, None] * _PIXELS**2
+        silhouette = stand.nearest.ravel()[image][:, None] * _PIXELS**2
         front = self._front.ravel().take(silhouette + pixel, mode="clip")
-        hides, point = np.nonzero(inside & (front > nearer + self._clearance))
-        hidden = np.zeros((k * V, p), bool)
-        hidden[pair[hides], point] = True
-        return 1.0 - hidden.mean(axis=1).reshape(k, V)
+        hides = inside & (front > nearer + self._clearance)
+        first = np.flatnonzero(np.diff(pair, prepend=-1))
+        hidden.reshape(n * V, p)[pair[first]] |= np.logical_or.reduceat(hides, first, axis=0)

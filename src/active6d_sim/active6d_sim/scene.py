@@ -33,7 +33,7 @@ class Bin:
     @classmethod
     def for_model(cls, model: ObjectModel) -> "Bin":
         """The square bin that the model's usual number of instances lies in, see ``ObjectModel.bin_width``."""
-        return cls(model.bin_width, model.bin_width, round(0.6 * model.diameter, 3))
+        return cls(model.bin_width, model.bin_width, model.wall_height)
 
 
 @dataclass(frozen=True, eq=False)
