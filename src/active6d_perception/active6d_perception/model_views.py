@@ -125,8 +125,7 @@ def visible_from(mesh: trimesh.Trimesh, eyes: np.ndarray, points: np.ndarray, no
     Returns:
         (m, s) bool.
     """
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+    scene = ray_caster(mesh)
     rays = np.empty((len(eyes), len(points), 6), np.float32)
     rays[..., :3] = eyes[:, None]
     rays[..., 3:] = points[None] - rays[..., :3]
@@ -134,3 +133,10 @@ def visible_from(mesh: trimesh.Trimesh, eyes: np.ndarray, points: np.ndarray, no
     unhidden = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy() > 0.999
     facing = -np.einsum("msi,si->ms", rays[..., 3:], normals) > 0
     return unhidden & facing
+
+
+def ray_caster(mesh: trimesh.Trimesh, threads: int = 0) -> o3d.t.geometry.RaycastingScene:
+    """A mesh to cast rays at and to measure distances from; 0 threads are as many as there are cores."""
+    scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
+    scene.add_triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+    return scene

@@ -10,10 +10,10 @@ from functools import cached_property, lru_cache
 from itertools import product
 
 import numpy as np
-import open3d as o3d
 
 from active6d_core.camera import PinholeCamera, pixel_rays, project
 from active6d_core.object_model import ObjectModel
+from active6d_perception.model_views import ray_caster
 
 # Images are thinned to about this focal length in pixels (every second pixel each way of a VGA image), so that what is
 # seen depends little on their resolution; a cell counts as seen with this many pixels in it.
@@ -152,9 +152,7 @@ class Explainer:
         low, high = model.mesh.bounds + [[-reach - self._voxel], [reach + self._voxel]]
         shape = np.ceil((high - low) / self._voxel).astype(int) + 1
         self._low = low
-        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        mesh = model.mesh
-        scene.add_triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+        scene = ray_caster(model.mesh, threads=1)
         centres = low + (np.indices(shape).reshape(3, -1).T + 0.5) * self._voxel
         near = scene.compute_distance(centres.astype(np.float32), nthreads=1).numpy().reshape(shape) <= reach
         # What lies outside of the table is looked up in its outermost layer.

@@ -1,8 +1,8 @@
 """How much of every known object a camera would see from places where it has not been.
 
 Objects hide each other. For a few points of each object's outline as a view sees it, the silhouettes of the objects
-between say whether they are hidden there. Silhouettes are looked up among those of directions all around the model, so
-that a hundred views of fifteen objects cost a millisecond, where rendering them would cost a hundred.
+between say whether they are hidden there. Silhouettes are looked up among those of directions all around the model,
+which takes a small part of the time that rendering a hundred views would.
 """
 
 from functools import lru_cache
@@ -14,6 +14,7 @@ import trimesh
 from scipy.cluster.vq import kmeans2
 
 from active6d_core.object_model import ObjectModel
+from active6d_perception.model_views import ray_caster
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 directions
 _PIXELS = 24  # across a silhouette
@@ -99,8 +100,7 @@ class ExpectedVisibility:
         self._points = np.ascontiguousarray(np.moveaxis(points, -1, 0))
 
     def _look_from(self, mesh: trimesh.Trimesh, frames: np.ndarray) -> np.ndarray:
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+        scene = ray_caster(mesh)
         eyes = np.stack(np.meshgrid(self._pixel_centres, self._pixel_centres, [2 * self._reach], indexing="ij"), -1)
         origins = eyes.reshape(-1, 3) @ frames
         rays = np.concatenate([origins, np.broadcast_to(-frames[:, 2:], origins.shape)], axis=-1)

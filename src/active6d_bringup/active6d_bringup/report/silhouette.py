@@ -11,6 +11,7 @@ from scipy.ndimage import binary_opening, gaussian_filter
 from active6d_core.camera import PinholeCamera, pixel_rays
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, transform_points
+from active6d_perception.model_views import ray_caster
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +46,7 @@ class SilhouetteDrawer:
         self._radius = float(np.linalg.norm(model.mesh.vertices, axis=1).max())
         self._corners = np.array(np.meshgrid(*([[-1.0, 1.0]] * 3))).reshape(3, -1).T * self._radius
         self._axis_tips = np.concatenate([np.zeros((1, 3)), np.eye(3) * 0.4 * model.diameter])
-        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self._scene.add_triangles(
-            o3d.core.Tensor(np.asarray(model.mesh.vertices, np.float32)),
-            o3d.core.Tensor(np.asarray(model.mesh.faces, np.uint32)),
-        )
+        self._scene = ray_caster(model.mesh, threads=1)
 
     def depth(self, T_camera_object: np.ndarray, camera: PinholeCamera) -> tuple[tuple[slice, slice], np.ndarray]:
         """The model's own depth under (4, 4) ``T_camera_object``.
