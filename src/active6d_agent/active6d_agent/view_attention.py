@@ -151,8 +151,8 @@ class ViewAttention(nn.Module):
         return _Seen(e, total, whole, attention, mask)
 
     def describe(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What is known of (B, n, 17) objects and patches, (B, M, n, 12) pairs and (B, M, 8) views; none of it names a
-        direction of the world but the vertical."""
+        """What is known of (B, n, 17) objects and patches, (B, M, n, 12) pairs and (B, M, 8) views; of the world's
+        directions only the vertical counts, but for what the square tray hides."""
         pose, taken, grid = state["pose"], state["taken"], state["views"]
         shown, seen = state["shown"], state["seen"]
         rotation, centre = pose[..., :3], pose[..., 3]
