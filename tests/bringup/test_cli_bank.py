@@ -83,6 +83,17 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
     assert measured["found_in_one_view"] == pytest.approx(np.mean(found))
 
 
+def test_no_heap_is_in_two_splits():
+    from active6d_bringup.cli.bank import _scene_names
+    from active6d_sim.scene_store import FIRST_STORED_SEED
+
+    train, validation = (_scene_names("mug", split, None, 200) for split in ("train", "val"))
+    assert len(train) == 224 and len(validation) == 206
+    assert not set(train) & set(validation)
+    dropped = [int(name.split("/")[-1]) for name in train + validation if "/seed/" in name]
+    assert max(dropped) < FIRST_STORED_SEED
+
+
 def test_a_scene_is_seen_as_the_graph_sees_it(monkeypatch):
     """Simulator, estimator and verification from two views; float32 tables of what they say."""
     from active6d_core.object_model import load_object
@@ -233,7 +244,7 @@ def test_missing_seeds_are_trained(tmp_path, monkeypatch):
         (["bank", "--split", "holdout"], "--split 'holdout'"),
         (["bank", "--estimator", "psychic"], "unknown estimator 'psychic'"),
         (["bank", "--object", "teapot"], "unknown object 'teapot'"),
-        (["bank", "--heaps", "3"], "--heaps adds to the training scenes"),
+        (["bank", "--heaps", "3"], "--heaps adds to the scenes of train and val"),
     ],
 )
 def test_bad_input_is_one_clear_line(banks, arguments, words):

@@ -12,8 +12,9 @@ from active6d_bringup.cli.train import single_threaded
 if TYPE_CHECKING:
     from active6d_agent.bank import BankScene, SceneBank
 
-#: Heaps beside the stored scenes have these seeds: of no stored scene, and of no heap that an estimator learns from.
-FIRST_HEAP = 50_000
+#: Heaps beside a split's stored scenes have seeds from here on: of no stored scene, and of no heap that an estimator
+#: learns from. Test scenes are the stored ones only.
+FIRST_HEAP = {"train": 50_000, "val": 60_000}
 Banks = Annotated[Path | None, typer.Option("--banks", metavar="DIR", help="Folder of the banks; the cache's.")]
 
 
@@ -22,7 +23,7 @@ def bank(
     split: Annotated[str, typer.Option(help="Which stored scenes: train, val or test.")] = "test",
     estimator: Annotated[str, typer.Option(help="Who finds poses in one view.")] = "auto",
     scenes: Annotated[int | None, typer.Option(min=1, help="That many of the scenes; all by default.")] = None,
-    heaps: Annotated[int, typer.Option(min=0, help="That many more heaps, dropped by seed; for training.")] = 0,
+    heaps: Annotated[int, typer.Option(min=0, help="That many more heaps, dropped by seed; for train and val.")] = 0,
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the sensor's noise.")] = 1.0,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for one a core.")] = 0,
     banks: Banks = None,
@@ -69,12 +70,12 @@ def _scene_names(object_name: str, split: str, scenes: int | None, heaps: int) -
 
     if split not in SPLITS:
         raise ValueError(f"--split '{split}' is not among {', '.join(SPLITS)}")
-    if heaps and split != "train":
-        raise ValueError(f"--heaps adds to the training scenes, not to split '{split}'")
+    if heaps and split not in FIRST_HEAP:
+        raise ValueError(f"--heaps adds to the scenes of {' and '.join(FIRST_HEAP)}, not to split '{split}'")
     load_object(object_name)
     load_scene(object_name, split, 0)  # says how to make the stored scenes where they are missing
     stored = [f"{object_name}/{split}/{index}" for index in range(min(scenes or SPLITS[split], SPLITS[split]))]
-    return stored + [f"{object_name}/seed/{FIRST_HEAP + index}" for index in range(heaps)]
+    return stored + [f"{object_name}/seed/{FIRST_HEAP[split] + index}" for index in range(heaps)]
 
 
 def _provenance(object_name: str, estimator: str, noise: float, seed: int) -> dict[str, Any]:
