@@ -88,7 +88,7 @@ def test_no_heap_is_in_two_splits():
     from active6d_sim.scene_store import FIRST_STORED_SEED
 
     train, validation = (_scene_names("mug", split, None, 200) for split in ("train", "val"))
-    assert len(train) == 224 and len(validation) == 206
+    assert (len(train), len(validation)) == (224, 206)
     assert not set(train) & set(validation)
     dropped = [int(name.split("/")[-1]) for name in train + validation if "/seed/" in name]
     assert max(dropped) < FIRST_STORED_SEED
