@@ -72,7 +72,7 @@ def test_replay_equals_the_recording(tmp_path):
     progress = []
     result = replay(ReplaySettings(tmp_path / "bag", domain=fresh_domain()), lambda *count: progress.append(count))
     assert result.equal, result.largest_differences()
-    assert (result.views, len(result.comparisons)) == (4, 12)
+    assert (result.views, len(result.comparisons)) == (4, 16)
     assert progress[-1] == (4, 4)
 
 

@@ -24,6 +24,7 @@ COMPARED = {
     "hypotheses": "sensor_msgs/msg/PointCloud2",
     "hypotheses/segmentation": "sensor_msgs/msg/Image",
     "objects": "sensor_msgs/msg/PointCloud2",
+    "objects/unexplained": "sensor_msgs/msg/PointCloud2",
 }
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
