@@ -85,7 +85,7 @@ def _run(settings: "ReplaySettings") -> "ReplayResult":
 
 def _print_comparison(result: "ReplayResult") -> None:
     if result.equal:
-        console.print("[green]equal[/green]: hypotheses, masks, objects and unexplained surface of every view are the recorded ones")
+        console.print("[green]equal[/green]: every view's hypotheses, masks, objects and surface are the recorded ones")
         return
     views = {comparison.stamp for comparison in result.comparisons if not comparison.equal}
     console.print(f"[red]different[/red] in {len(views)} of {result.views} views")
