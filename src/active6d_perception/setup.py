@@ -19,6 +19,7 @@ setup(
     install_requires=[
         "active6d_core",
         "matplotlib",
+        "numba",
         "numpy",
         "open3d-cpu",
         "pyyaml",

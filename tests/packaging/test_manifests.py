@@ -25,6 +25,7 @@ LIBRARIES = {
     "matplotlib": ("python3-matplotlib", "matplotlib"),
     "mcap": ("mcap-ros2-support", "mcap"),
     "mcap_ros2": ("mcap-ros2-support", "mcap-ros2-support"),
+    "numba": (None, "numba"),
     "numpy": ("python3-numpy", "numpy"),
     "open3d": ("python3-open3d-pip", "open3d-cpu"),
     "pybullet": ("python3-pybullet-pip", "pybullet"),

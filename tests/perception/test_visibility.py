@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from active6d_core.object_model import load_object
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.visibility import Tray, expected_visibility, walled
+from active6d_perception.visibility import OPEN_TABLE, Tray, expected_visibility, walled
 
 NAMES = ("mug", "bunny", "coffee_cup")
 
@@ -92,11 +92,11 @@ def test_walls_hide_what_rays_through_boxes_miss():
             scene.add_triangles(box.translate(o3d.core.Tensor(corner, dtype=o3d.core.float32)))
     rays = np.concatenate(np.broadcast_arrays(points[:, None], eyes - points[:, None]), axis=-1).astype(np.float32)
     hidden = scene.test_occlusions(o3d.core.Tensor(rays)).numpy()
-    starts = np.broadcast_to(points.T[:, :, None, None], (3, 30, 100, 1))
-    told = walled(starts, eyes, tray)[..., 0]
+    points, eyes = points.astype(np.float32), eyes.astype(np.float32)
+    told = np.array([[walled(point, eye, Tray(*np.float32(tray))) for eye in eyes] for point in points])
     assert 0.05 < hidden.mean() < 0.5
     assert (told == hidden).mean() > 0.999
-    assert not walled(starts, eyes, None).any()
+    assert not any(walled(point, eye, Tray(*np.float32(OPEN_TABLE))) for eye in eyes for point in points)
 
 
 def test_a_tray_hides_the_low_from_low_eyes():

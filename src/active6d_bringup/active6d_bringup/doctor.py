@@ -73,6 +73,7 @@ def _libraries() -> Iterator[Check]:
         mend = "" if found else f"apt install {package} (as root); Open3D loads it"
         yield Check("System libraries", f"lib{file}", bool(found), False, found or "not found", mend)
     needed = {
+        "numba": "numba",
         "numpy": "numpy",
         "scipy": "scipy",
         "trimesh": "trimesh",

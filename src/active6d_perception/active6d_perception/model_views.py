@@ -7,7 +7,9 @@ is at most about 5 degrees from one) that the visible set is the same but for a 
 """
 
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
+import numba
 import numpy as np
 import open3d as o3d
 import trimesh
@@ -18,12 +20,78 @@ from active6d_core.object_model import ObjectModel
 _SUBDIVISIONS = 3  # of an icosahedron: 642 directions
 _EYE_DISTANCE = 6.0  # in diameters: 0.8 m for an object of 0.14 m, as on the view hemisphere
 _SAMPLES = 4096
+# Edge of a cell of samples, in their spacing: a few samples a cell.
+_CELL = 3.0
 
 
 @lru_cache(maxsize=16)
 def model_views(model: ObjectModel) -> "ModelViews":
     """The views of ``model``, made once per process."""
     return ModelViews(model)
+
+
+class _Cells(NamedTuple):
+    """Samples of a surface sorted into cubes, so that few of them are looked at to find the nearest.
+
+    Cells are numbered ``(ix * ny + iy) * nz + iz``.
+    """
+
+    low: np.ndarray
+    """(3,) corner that cells are counted from, object frame, metres"""
+    edge: float
+    """of a cell, metres"""
+    shape: tuple[int, int, int]
+    """number of cells along x, y and z"""
+    start: np.ndarray
+    """(cells + 1,) first sample of each cell in the sorted order"""
+    order: np.ndarray
+    """(s,) index of the sample at each place of the sorted order"""
+    points: np.ndarray
+    """(s, 3) float32 samples in the sorted order, metres"""
+    visible: np.ndarray
+    """(m, s) bool, whether a direction sees them"""
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_visible(
+    points: np.ndarray, direction: np.ndarray, bound: float, cells: _Cells
+) -> tuple[np.ndarray, np.ndarray]:
+    """See :meth:`ModelViews.nearest_visible`; compiled, since every point has other few samples to look at."""
+    distance, found = np.full(len(points), np.inf), np.full(len(points), -1)
+    for index in range(len(points)):
+        # Most points are near the surface, and what is found within an edge needs no farther search.
+        for reach in (min(cells.edge, bound), bound):
+            square, place = _nearest_within(points[index], cells.visible[direction[index]], reach, cells)
+            if place >= 0:
+                distance[index], found[index] = np.sqrt(square), cells.order[place]
+                break
+    return distance, found
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_within(point: np.ndarray, visible: np.ndarray, reach: float, cells: _Cells) -> tuple[float, int]:
+    """Squared distance and place in the sorted order of the (s,) visible sample nearest to a (3,) point, -1 where none
+    is within ``reach``."""
+    square, best = reach * reach, -1
+    x, y, z = point[0] - cells.low[0], point[1] - cells.low[1], point[2] - cells.low[2]
+    first, last = _cell(z - reach, 2, cells), _cell(z + reach, 2, cells)
+    for i in range(_cell(x - reach, 0, cells), _cell(x + reach, 0, cells) + 1):
+        for j in range(_cell(y - reach, 1, cells), _cell(y + reach, 1, cells) + 1):
+            column = (i * cells.shape[1] + j) * cells.shape[2]
+            for place in range(cells.start[column + first], cells.start[column + last + 1]):
+                sample = cells.points[place]
+                dx, dy, dz = point[0] - sample[0], point[1] - sample[1], point[2] - sample[2]
+                # No branches: which sample is visible or nearer, a processor cannot foresee.
+                candidate = dx * dx + dy * dy + dz * dz if visible[place] else np.inf
+                best = place if candidate < square else best
+                square = min(square, candidate)
+    return square, best
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _cell(along: float, axis: int, cells: _Cells) -> int:
+    """The nearest cell to a coordinate from the corner, metres."""
+    return int(min(max(along / cells.edge, 0.0), cells.shape[axis] - 1.0))
 
 
 class ModelViews:
@@ -83,18 +151,19 @@ class ModelViews:
         Returns:
             (n,) distances and (n,) indices of the samples; ``inf`` and -1 where none is within ``bound``.
         """
-        samples, tree = self._visible_forest
-        distance, found = tree.query(np.column_stack([points, direction]), distance_upper_bound=bound)
-        return distance, samples[found]
+        return _nearest_visible(np.ascontiguousarray(points, float), direction, bound, self._cells)
 
     @cached_property
-    def _visible_forest(self) -> tuple[np.ndarray, cKDTree]:
-        """All directions' visible samples, and -1, and one tree of them: the direction is a fourth coordinate, in which
-        neighbours are a metre apart, so that one search serves points of many directions."""
-        direction, sample = np.nonzero(self.visible)
-        tree = cKDTree(np.column_stack([self.points[sample], direction]), 24, compact_nodes=False, balanced_tree=False)
-        # Where nothing is in reach the tree answers with its own size.
-        return np.append(sample, -1), tree
+    def _cells(self) -> "_Cells":
+        low, edge = self.points.min(axis=0).astype(float), _CELL * self.spacing
+        place = ((self.points - low) / edge).astype(np.intp)
+        shape = tuple((place.max(axis=0) + 1).tolist())
+        number = np.ravel_multi_index(tuple(place.T), shape)
+        order = np.argsort(number, kind="stable")
+        start = np.searchsorted(number[order], np.arange(np.prod(shape) + 1))
+        # Small numbers, so that all of it stays in the processor's cache.
+        start, small = start.astype(np.int16), order.astype(np.int16)
+        return _Cells(low, edge, shape, start, small, self.points[order], self.visible[:, order])
 
     def visible_subset(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """At most ``count`` visible samples a direction, evenly taken: (m, count) indices, (m, count) bool used."""

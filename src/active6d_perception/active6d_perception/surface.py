@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
 
+import numba
 import numpy as np
 
 from active6d_core.camera import PinholeCamera, pixel_rays, project
@@ -101,17 +102,8 @@ class SurfaceGrid:
         z = depth[::stride, ::stride][rows, columns].ravel()
         rays = _rays(camera)[:, rows, columns].reshape(3, -1)
         along = (T_world_camera[:3, :3] / self.cell).astype(np.float32) @ rays * z
-        # One more layer of cells on every side takes what lies outside, and depth that is missing.
-        along += ((T_world_camera[:3, 3:] - self.low[:, None]) / self.cell + 1.0).astype(np.float32)
-        padded = tuple(count + 2 for count in self.shape)
-        np.fmax(along, 0.0, out=along)
-        # Whole numbers of this size are exact in float32, which is faster than integers are.
-        cells = np.zeros(len(z), np.float32)
-        for index, count in zip(along, padded, strict=True):
-            cells *= count
-            cells += np.floor(np.minimum(index, count - 1, out=index), out=index)
-        counts = np.bincount(cells.astype(np.intp), minlength=int(np.prod(padded))).reshape(padded)
-        return (counts[1:-1, 1:-1, 1:-1] >= _LEAST_POINTS).ravel()
+        along += ((T_world_camera[:3, 3:] - self.low[:, None]) / self.cell).astype(np.float32)
+        return _count(along, self.shape) >= _LEAST_POINTS
 
     def _window(self, camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[slice, slice]:
         """Rows and columns of the thinned image that the box can appear in: all where it reaches behind the camera."""
@@ -124,6 +116,17 @@ class SurfaceGrid:
         low = np.maximum(np.floor(pixels.min(axis=0) / stride) - 1, 0).astype(int)
         high = np.maximum(np.ceil(pixels.max(axis=0) / stride) + 2, 0).astype(int)
         return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(along: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """(cells,) how many of (3, k) points, in cells from the grid's corner and NaN where invalid, are in each cell."""
+    counts = np.zeros(shape[0] * shape[1] * shape[2], np.int32)
+    for index in range(along.shape[1]):
+        x, y, z = along[0, index], along[1, index], along[2, index]
+        if 0 <= x < shape[0] and 0 <= y < shape[1] and 0 <= z < shape[2]:
+            counts[(int(x) * shape[1] + int(y)) * shape[2] + int(z)] += 1
+    return counts
 
 
 @lru_cache(maxsize=4)
@@ -158,18 +161,44 @@ class Explainer:
         # What lies outside of the table is looked up in its outermost layer.
         self._near = np.zeros(shape, bool)
         self._near[1:-1, 1:-1, 1:-1] = near[1:-1, 1:-1, 1:-1]
+        self.explains(np.zeros((1, 3)), np.eye(4)[None])  # now, so that no view waits for the compiler
 
     def explains(self, points: np.ndarray, T_world_object: np.ndarray) -> np.ndarray:
         """Whether each of (k, 3) points in the world is near the surface of each of (n, 4, 4) poses: (n, k) bool."""
-        R, t = T_world_object[:, :3, :3] / self._voxel, T_world_object[:, :3, 3]
-        entry = np.zeros((len(R), len(points)), np.int32)
-        # One axis of the table after the other: several times faster than all coordinates of a point together.
-        for axis, count in enumerate(self._near.shape):
-            along = R[:, :, axis] @ points.T
-            along -= (R[:, :, axis] * t).sum(axis=1, keepdims=True) + self._low[axis] / self._voxel
-            entry *= count
-            entry += np.clip(along, 0, count - 1, out=along).astype(np.int32)
-        return self._near.ravel().take(entry)
+        R = T_world_object[:, :3, :3] / self._voxel
+        origin = -np.einsum("ni,nij->nj", T_world_object[:, :3, 3], R) - self._low / self._voxel
+        return _look_up(np.ascontiguousarray(np.transpose(points), float), R, origin, self._near)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _look_up(points: np.ndarray, rotation: np.ndarray, origin: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Entries of a table at points that n poses take there.
+
+    Args:
+        points: (3, k).
+        rotation: (n, 3, 3), transposed, and to the table's units.
+        origin: (n, 3) where the points' origin is in the table.
+        table: (nx, ny, nz) bool.
+
+    Returns:
+        (n, k) entries, outside of the table its first one.
+    """
+    found, entry = np.empty((len(rotation), points.shape[1]), np.bool_), np.empty(points.shape[1], np.uint32)
+    (nx, ny, nz), flat = table.shape, table.ravel()
+    for pose in range(len(rotation)):
+        R, o = rotation[pose], origin[pose]
+        # Of two loops the first works on several points at once.
+        for index in range(points.shape[1]):
+            x, y, z = points[0, index], points[1, index], points[2, index]
+            i = x * R[0, 0] + y * R[1, 0] + z * R[2, 0] + o[0]
+            j = x * R[0, 1] + y * R[1, 1] + z * R[2, 1] + o[1]
+            k = x * R[0, 2] + y * R[1, 2] + z * R[2, 2] + o[2]
+            inside = (i >= 0) & (i < nx) & (j >= 0) & (j < ny) & (k >= 0) & (k < nz)
+            place = np.uint32((np.int32(i) * ny + np.int32(j)) * nz + np.int32(k))
+            entry[index] = place if inside else np.uint32(0)
+        for index in range(points.shape[1]):
+            found[pose, index] = flat[entry[index]]
+    return found
 
 
 @lru_cache(maxsize=8)
@@ -190,6 +219,7 @@ class SceneSurface:
     def __init__(self, model: ObjectModel, grid: SurfaceGrid | None = None, within: float = EXPLAINED_WITHIN) -> None:
         self.grid = grid or SurfaceGrid.for_model(model)
         self._explainer = explainer(model, within)
+        _count(np.zeros((3, 0), np.float32), self.grid.shape)  # now, so that no view waits for the compiler
         self.reset()
 
     def reset(self) -> None:

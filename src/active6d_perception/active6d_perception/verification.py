@@ -1,5 +1,6 @@
 """The verification score: how well a hypothesis fits the depth inside its own mask (paper, equation 1)."""
 
+import numba
 import numpy as np
 
 from active6d_core.camera import PinholeCamera
@@ -48,7 +49,8 @@ class Verifier:
                 raise ValueError(f"verification: {name} must be positive, got {value}")
         self.epsilon, self.samples, self.reach = epsilon, samples, reach
         self.views: ModelViews = model_views(model)
-        self.views.nearest_visible(np.zeros((1, 3)), np.zeros(1), epsilon)  # now, so that no view waits for it later
+        # Now, so that no view waits for the compiler.
+        self.score(np.zeros((1, 1), np.float32), PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0), Hypotheses.empty(1, 1))
 
     def score(self, depth: np.ndarray, camera: PinholeCamera, hypotheses: Hypotheses) -> np.ndarray:
         """Verification scores c of all hypotheses of a view.
@@ -86,10 +88,7 @@ class Verifier:
         Returns:
             (n,) values of equation 1.
         """
-        # Whole rows are taken: several times faster than indexing into them.
-        T = T_camera_object.take(owner, axis=0)
-        R, t = T[:, :3, :3], T[:, :3, 3]
-        q = np.einsum("ni,nij->nj", points - t, R)
+        q, n_q = _into_object_frames(points, normals, np.ascontiguousarray(T_camera_object, float), owner)
         direction = self.views.nearest_direction(T_camera_object)[owner]
         distance, p = self.views.nearest_visible(q, direction, self.epsilon + self.views.spacing)
         reached = np.flatnonzero(p >= 0)
@@ -98,7 +97,7 @@ class Verifier:
         off_plane = np.einsum("ni,ni->n", q - self.views.points.take(p, axis=0), n_p)
         along = np.sqrt(np.maximum(distance**2 - off_plane**2, 0.0))
         to_surface = np.hypot(off_plane, np.maximum(along - self.views.spacing, 0.0))
-        product = np.einsum("ni,ni->n", np.einsum("ni,nij->nj", normals, R).take(reached, axis=0), n_p)
+        product = np.einsum("ni,ni->n", n_q.take(reached, axis=0), n_p)
         fits = np.zeros(len(points))
         fits[reached] = local_fit(to_surface, product, self.epsilon)
         return fits
@@ -111,19 +110,8 @@ class Verifier:
         """
         height, width = depth.shape
         corners = np.rint(np.clip(hypotheses.box, 0.0, 1.0) * (width, height, width, height)).astype(int)
-        inside = []
-        for (x0, y0, x1, y1), label in zip(corners.tolist(), hypotheses.label, strict=True):
-            crop = (slice(y0, y1), slice(x0, x1))
-            inside.append(np.flatnonzero((hypotheses.segmentation[crop] == label) & np.isfinite(depth[crop])))
-        sizes = np.array([len(flat) for flat in inside], int)
-        counts = np.minimum(sizes, self.samples)
-        owner = np.repeat(np.arange(len(hypotheses)), counts)
-        place = np.arange(len(owner)) - (np.cumsum(counts) - counts)[owner]
-        stretched = place * (sizes[owner] - 1) // max(self.samples - 1, 1)
-        chosen = np.where(sizes[owner] > self.samples, stretched, place) + (np.cumsum(sizes) - sizes)[owner]
-        x0, y0, x1, _ = corners.take(owner, axis=0).T
-        rows, columns = np.divmod(np.concatenate([*inside, np.zeros(0, int)])[chosen], x1 - x0)
-        return (rows + y0) * width + columns + x0, owner
+        images = np.require(hypotheses.segmentation, np.uint16, "CW"), np.require(depth, np.float32, "CW")
+        return _pixels_in_boxes(*images, corners, hypotheses.label.astype(np.uint16), self.samples)
 
 
 def points_and_normals(
@@ -143,24 +131,100 @@ def points_and_normals(
     Returns:
         (n, 3) points in the optical frame and (n, 3) unit normals facing the camera, zero where both sides are missing.
     """
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    return _points_and_normals(np.require(depth, np.float32, "CW"), intrinsics, np.asarray(pixels), reach)
+
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_Vector = tuple[float, float, float]
+
+
+@_compiled
+def _pixels_in_boxes(
+    segmentation: np.ndarray, depth: np.ndarray, corners: np.ndarray, label: np.ndarray, samples: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """See :meth:`Verifier.mask_pixels`; ``corners`` (k, 4) are x and y of the boxes' pixels, the last ones excluded."""
+    width = depth.shape[1]
+    pixels, owner = np.empty(len(label) * samples, np.int64), np.empty(len(label) * samples, np.int64)
+    inside, total = np.empty(depth.size, np.int64), 0
+    for index in range(len(label)):
+        x0, y0, x1, y1 = corners[index]
+        count = 0
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                # Written in any case and kept if it counts: a branch here is slower.
+                inside[count] = y * width + x
+                count += (segmentation[y, x] == label[index]) & np.isfinite(depth[y, x])
+        for place in range(min(count, samples)):
+            stretched = place * (count - 1) // max(samples - 1, 1) if count > samples else place
+            pixels[total], owner[total] = inside[stretched], index
+            total += 1
+    return pixels[:total], owner[:total]
+
+
+@_compiled
+def _points_and_normals(
+    depth: np.ndarray, intrinsics: tuple[float, float, float, float], pixels: np.ndarray, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """See :func:`points_and_normals`; intrinsics are fx, fy, cx and cy."""
     height, width = depth.shape
-    v, u = np.divmod(pixels, width)
-    # The pixel, then the one after and the one before it along the row, then along the column.
-    u = np.clip(u + reach * np.array([[0], [1], [-1], [0], [0]]), 0, width - 1)
-    v = np.clip(v + reach * np.array([[0], [0], [0], [1], [-1]]), 0, height - 1)
-    z = depth.take(v * width + u).astype(float)
-    # Coordinates first, so that each is one contiguous row.
-    around = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
-    points = around[:, 0]
-    after, before = around[:, 1::2] - points[:, None], points[:, None] - around[:, 2::2]
-    jump_after, jump_before = np.abs(after[2]), np.abs(before[2])
-    one_side = np.where((jump_after <= jump_before) | np.isnan(jump_before), after, before)
+    points, normals = np.empty((len(pixels), 3)), np.zeros((len(pixels), 3))
+    for index in range(len(pixels)):
+        v, u = divmod(pixels[index], width)
+        centre = x, y, z = _backproject(depth, intrinsics, u, v)
+        points[index, 0], points[index, 1], points[index, 2] = centre
+        right, left = min(u + reach, width - 1), max(u - reach, 0)
+        below, above = min(v + reach, height - 1), max(v - reach, 0)
+        ax, ay, az = _tangent(
+            _backproject(depth, intrinsics, left, v), centre, _backproject(depth, intrinsics, right, v)
+        )
+        bx, by, bz = _tangent(
+            _backproject(depth, intrinsics, u, above), centre, _backproject(depth, intrinsics, u, below)
+        )
+        nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if length > 0:
+            # Facing the camera is against the ray to the point.
+            length = -length if nx * x + ny * y + nz * z > 0 else length
+            normals[index, 0], normals[index, 1], normals[index, 2] = nx / length, ny / length, nz / length
+    return points, normals
+
+
+@_compiled
+def _backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float], u: int, v: int) -> _Vector:
+    """The point of one pixel in the optical frame."""
+    fx, fy, cx, cy = intrinsics
+    z = float(depth[v, u])
+    return (u - cx) / fx * z, (v - cy) / fy * z, z
+
+
+@_compiled
+def _tangent(before: _Vector, centre: _Vector, after: _Vector) -> _Vector:
+    """Of a surface at the middle one of three points in line, NaN where it has no neighbour."""
+    jump_after, jump_before = abs(after[2] - centre[2]), abs(centre[2] - before[2])
     # A smooth surface changes its slope little within a few pixels; 5 mm between the two sides is an edge.
-    smooth = np.abs(jump_after - jump_before) < 0.005
-    (ax, bx), (ay, by), (az, bz) = np.where(smooth, after + before, one_side)
-    normals = np.nan_to_num(np.stack([by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax]))
-    length = np.sqrt((normals**2).sum(axis=0))
-    # Facing the camera is against the ray to the point.
-    length[(normals * points).sum(axis=0) > 0] *= -1
-    np.divide(normals, length, out=normals, where=length != 0)
-    return points.T, normals.T
+    smooth = abs(jump_after - jump_before) < 0.005
+    if not smooth and (jump_after <= jump_before or np.isnan(jump_before)):
+        return after[0] - centre[0], after[1] - centre[1], after[2] - centre[2]
+    if not smooth:
+        return centre[0] - before[0], centre[1] - before[1], centre[2] - before[2]
+    return (
+        after[0] - centre[0] + (centre[0] - before[0]),
+        after[1] - centre[1] + (centre[1] - before[1]),
+        after[2] - centre[2] + (centre[2] - before[2]),
+    )
+
+
+@_compiled
+def _into_object_frames(
+    points: np.ndarray, normals: np.ndarray, T_camera_object: np.ndarray, owner: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 3) of the optical frame in those of the objects at (k, 4, 4), each in its owner's."""
+    q, n_q = np.empty(points.shape), np.empty(points.shape)
+    for index in range(len(points)):
+        T, point, normal = T_camera_object[owner[index]], points[index], normals[index]
+        x, y, z = point[0] - T[0, 3], point[1] - T[1, 3], point[2] - T[2, 3]
+        for axis in range(3):
+            q[index, axis] = x * T[0, axis] + y * T[1, axis] + z * T[2, axis]
+            n_q[index, axis] = normal[0] * T[0, axis] + normal[1] * T[1, axis] + normal[2] * T[2, axis]
+    return q, n_q

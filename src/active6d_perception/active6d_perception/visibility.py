@@ -2,12 +2,14 @@
 
 Objects hide each other. For a few points of each object's outline as a view sees it, the silhouettes of the objects
 between say whether they are hidden there. Silhouettes are looked up among those of directions all around the model,
-which takes a small part of the time that rendering a hundred views would.
+which takes a small part of the time that rendering a hundred views would. The look-up is compiled: what is hidden needs
+no second look, which operations on whole arrays cannot make use of.
 """
 
 from functools import lru_cache
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import open3d as o3d
 import trimesh
@@ -18,12 +20,16 @@ from active6d_perception.model_views import ray_caster
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 directions
 _PIXELS = 24  # across a silhouette
-# Points of an object that are looked for.
-_POINTS = 10
+# Points of an object that are looked for, and room for as many as a processor works on at once.
+_POINTS, _LANES = 10, 16
 # Farther off the ray than this, in reaches of the model from its origin, no object hides much of another.
 _SIDEWAYS = 1.5
 # Nothing closer in front of a point than this fraction of the diameter hides it: poses are not exact.
 _CLEARANCE = 0.02
+
+
+# Without Python's check of every divisor.
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @lru_cache(maxsize=16)
@@ -46,17 +52,8 @@ class Tray(NamedTuple):
         return cls(model.bin_width, model.wall_height)
 
 
-def walled(points: np.ndarray, eyes: np.ndarray, tray: Tray | None) -> np.ndarray:
-    """(k, V, p) bool, whether the rays from (3, k, V, p) points to (V, 3) eyes leave the tray through a wall."""
-    if tray is None:
-        return np.zeros(points.shape[1:], bool)
-    x, y, z = eyes.T[:, None, :, None] - points
-    # Along the ray, from 0 at the point to 1 at the eye.
-    leaves = [
-        (0.5 * tray.width - np.copysign(1.0, ray) * start) / np.maximum(np.abs(ray), 1e-9)
-        for ray, start in ((x, points[0]), (y, points[1]))
-    ]
-    return points[2] + np.minimum(*leaves) * z < tray.wall_height
+#: No walls at all.
+OPEN_TABLE = Tray(0.0, -np.inf)
 
 
 class _Stand(NamedTuple):
@@ -70,8 +67,131 @@ class _Stand(NamedTuple):
     """(n, V) to the eyes, metres"""
     right: np.ndarray
     """(n, V, 3) unit vectors along the silhouette's rows, world"""
+    up: np.ndarray
+    """(n, V, 3) likewise along its columns"""
     nearest: np.ndarray
     """(n, V) index of the precomputed direction"""
+
+
+class _Silhouettes(NamedTuple):
+    """A model from m directions, and what it takes to be hidden behind it."""
+
+    front: np.ndarray
+    """(m, 1 + pixels * pixels) how far the surface comes towards the eye, metres; -inf for none, and in front"""
+    pixels_per_metre: np.float32
+    sideways: np.float32
+    """farther off a ray than this, from the model's origin, metres, it hides nothing"""
+    clearance: np.float32
+    """nor what lies less than this behind its surface, metres"""
+
+
+@_compiled
+def _shares(
+    points: np.ndarray, eyes: np.ndarray, tray: Tray, stand: _Stand, hiding: int, silhouettes: _Silhouettes
+) -> np.ndarray:
+    """What is left of objects' outlines; all numbers are float32.
+
+    Args:
+        points: (n, V, p, 3) of the outlines that the eyes see, from the objects' centres, world.
+        eyes: (V, 3) world.
+        tray: walls.
+        stand: of the objects.
+        hiding: so many of them hide others.
+        silhouettes: of the objects.
+
+    Returns:
+        (n, V) shares of the points that neither a wall nor another object hides.
+    """
+    n, V, p, _ = points.shape
+    shares, hidden, outlines = np.empty((n, V)), np.zeros((V, p), np.bool_), np.zeros((V, 3, _LANES), np.float32)
+    nearer, pixel = np.empty(_LANES, np.float32), np.empty(_LANES, np.uint32)
+    for target in range(n):
+        for view in range(V):
+            for index in range(p):
+                for axis in range(3):
+                    outlines[view, axis, index] = points[target, view, index, axis] + stand.centres[target, axis]
+                hidden[view, index] = walled(outlines[view, :, index], eyes[view], tray)
+        # Views last: neighbouring ones have the same objects in between, which makes the branch foreseeable.
+        for hider in range(hiding):
+            for view in range(V):
+                if _is_between(target, hider, view, stand, silhouettes.sideways):
+                    _project(outlines, hider, view, stand, silhouettes, nearer, pixel)
+                    direction = stand.nearest[hider, view]
+                    for index in range(p):
+                        hidden[view, index] |= silhouettes.front[direction, pixel[index]] > nearer[index]
+        for view in range(V):
+            shares[target, view] = 1.0 - hidden[view].sum() / p
+    return shares
+
+
+@_compiled
+def walled(point: np.ndarray, eye: np.ndarray, tray: Tray) -> bool:
+    """Whether the ray from a (3,) point to an (3,) eye leaves the tray through a wall; all float32."""
+    # Along the ray, from 0 at the point to 1 at the eye.
+    leaves = np.float32(np.inf)
+    for axis in range(2):
+        ray = eye[axis] - point[axis]
+        to_wall = np.float32(0.5) * tray.width - np.copysign(np.float32(1.0), ray) * point[axis]
+        leaves = min(leaves, to_wall / max(abs(ray), np.float32(1e-9)))
+    return point[2] + leaves * (eye[2] - point[2]) < tray.wall_height
+
+
+@_compiled
+def _is_between(target: int, hider: int, view: int, stand: _Stand, sideways: np.float32) -> bool:
+    """Whether an object is in front of another, and close to the ray from there to the eye."""
+    x = stand.centres[hider, 0] - stand.centres[target, 0]
+    y = stand.centres[hider, 1] - stand.centres[target, 1]
+    z = stand.centres[hider, 2] - stand.centres[target, 2]
+    rays = stand.rays
+    along = x * rays[target, view, 0] + y * rays[target, view, 1] + z * rays[target, view, 2]
+    return along > 0 and x * x + y * y + z * z - along * along < sideways * sideways
+
+
+@_compiled
+def _project(
+    points: np.ndarray,
+    hider: int,
+    view: int,
+    stand: _Stand,
+    silhouettes: _Silhouettes,
+    nearer: np.ndarray,
+    pixel: np.ndarray,
+) -> None:
+    """Where (V, 3, p) points are in the silhouette of an object.
+
+    Sets (p,) ``nearer`` to how far surface in front of them must come, and ``pixel``, 0 beside the silhouette.
+    """
+    # Numbers and no branches, so that it works on many points at once.
+    x0, y0, z0 = stand.centres[hider, 0], stand.centres[hider, 1], stand.centres[hider, 2]
+    right_x, right_y, right_z = stand.right[hider, view, 0], stand.right[hider, view, 1], stand.right[hider, view, 2]
+    up_x, up_y, up_z = stand.up[hider, view, 0], stand.up[hider, view, 1], stand.up[hider, view, 2]
+    ray_x, ray_y, ray_z = stand.rays[hider, view, 0], stand.rays[hider, view, 1], stand.rays[hider, view, 2]
+    distance, pixels = stand.distance[hider, view], np.float32(_PIXELS)
+    zero, one, middle = np.float32(0), np.float32(1), np.float32(_PIXELS / 2)
+    for index in range(_LANES):
+        x, y, z = points[view, 0, index] - x0, points[view, 1, index] - y0, points[view, 2, index] - z0
+        depth = x * ray_x + y * ray_y + z * ray_z
+        scale = silhouettes.pixels_per_metre * distance / (distance - depth)
+        row = (x * right_x + y * right_y + z * right_z) * scale + middle
+        column = (x * up_x + y * up_y + z * up_z) * scale + middle
+        inside = (row >= zero) & (row < pixels) & (column >= zero) & (column < pixels)
+        pixel[index] = np.uint32(one + np.floor(row) * pixels + np.floor(column) if inside else zero)
+        nearer[index] = depth + silhouettes.clearance
+
+
+@_compiled
+def _square(right: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Make (n, V, 3) ``right`` unit vectors square to the rays, in place; (n, V, 3) what is square to both."""
+    up = np.empty_like(right)
+    for index in np.ndindex(right.shape[:2]):
+        x, y, z = rays[index]
+        off = right[index][0] * x + right[index][1] * y + right[index][2] * z
+        i, j, k = right[index][0] - off * x, right[index][1] - off * y, right[index][2] - off * z
+        length = np.sqrt(i * i + j * j + k * k)
+        i, j, k = i / length, j / length, k / length
+        right[index] = i, j, k
+        up[index] = y * k - z * j, z * i - x * k, x * j - y * i
+    return up
 
 
 class ExpectedVisibility:
@@ -84,7 +204,6 @@ class ExpectedVisibility:
     def __init__(self, model: ObjectModel) -> None:
         mesh = model.mesh
         self._reach = float(np.linalg.norm(mesh.vertices, axis=1).max())
-        self._clearance = _CLEARANCE * model.diameter
         directions = np.asarray(trimesh.creation.icosphere(_SUBDIVISIONS).vertices)
         up = np.where(np.abs(directions[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
         right = np.cross(up, directions)
@@ -93,11 +212,16 @@ class ExpectedVisibility:
         front = self._look_from(mesh, frames)
         self._directions = directions.astype(np.float32)
         self._right = right.astype(np.float32)
-        # (m, pixels, pixels): how far towards the eye the surface comes, -inf beside the silhouette.
-        self._front = front.astype(np.float32)
-        # (3, m, p): points of each direction's outline, in the object's frame.
-        points = [self._spread_points(*pair) for pair in zip(frames, front, strict=True)]
-        self._points = np.ascontiguousarray(np.moveaxis(points, -1, 0))
+        self._silhouettes = _Silhouettes(
+            np.pad(front.astype(np.float32).reshape(len(front), -1), [(0, 0), (1, 0)], constant_values=-np.inf),
+            np.float32(_PIXELS / (2 * self._reach)),
+            np.float32(_SIDEWAYS * self._reach),
+            np.float32(_CLEARANCE * model.diameter),
+        )
+        # (m, p, 3): points of each direction's outline, in the object's frame.
+        self._points = np.stack([self._spread_points(*pair) for pair in zip(frames, front, strict=True)])
+        # Now, so that no decision waits for the compiler.
+        self.shares(np.eye(4)[None], np.array([[0.0, 0.0, 4 * self._reach]]))
 
     def _look_from(self, mesh: trimesh.Trimesh, frames: np.ndarray) -> np.ndarray:
         scene = ray_caster(mesh)
@@ -133,16 +257,14 @@ class ExpectedVisibility:
         Returns:
             (n, V) in [0, 1]: share of each object's silhouette that no other object and no wall hides.
         """
-        eyes = np.asarray(eyes, np.float32)
+        eyes = np.ascontiguousarray(eyes, np.float32)
         stand = self._stand(T_world_object, eyes)
         n, V = stand.nearest.shape
-        points = self._points[:, stand.nearest].transpose(1, 0, 2, 3).reshape(n, 3, V * _POINTS)
-        points = T_world_object[:, :3, :3].astype(np.float32) @ points + stand.centres[..., None]
-        # Coordinates first, so that each is one long row.
-        points = np.ascontiguousarray(points.transpose(1, 0, 2)).reshape(3, n, V, _POINTS)
-        hidden = walled(points, eyes, tray)
-        self._hide(hidden, points, stand, n if hiding is None else hiding)
-        return 1.0 - hidden.mean(axis=-1)
+        points = self._points.take(stand.nearest, axis=0).reshape(n, V * _POINTS, 3)
+        points = points @ T_world_object[:, :3, :3].transpose(0, 2, 1).astype(np.float32)
+        points = points.reshape(n, V, _POINTS, 3)
+        walls = Tray(*np.float32(OPEN_TABLE if tray is None else tray))
+        return _shares(points, eyes, walls, stand, n if hiding is None else hiding, self._silhouettes)
 
     def _stand(self, T_world_object: np.ndarray, eyes: np.ndarray) -> "_Stand":
         R = T_world_object[:, :3, :3].astype(np.float32)
@@ -154,30 +276,5 @@ class ExpectedVisibility:
         # The silhouette is that of the nearest direction, its place in the world is the eye's own: what lies far behind
         # would be shifted otherwise.
         right = self._right[nearest] @ R.transpose(0, 2, 1)
-        right -= (right * rays).sum(axis=-1, keepdims=True) * rays
-        right /= np.linalg.norm(right, axis=-1, keepdims=True)
-        return _Stand(centres, rays, distance, right, nearest)
-
-    def _hide(self, hidden: np.ndarray, points: np.ndarray, stand: "_Stand", hiding: int) -> None:
-        """Set (n, V, p) ``hidden`` where one of the first ``hiding`` objects hides (3, n, V, p) points of another."""
-        n, V, p = hidden.shape
-        apart = stand.centres[:hiding] - stand.centres[:, None]
-        along = apart @ stand.rays.transpose(0, 2, 1)
-        beside = (apart**2).sum(axis=-1)[..., None] - along**2
-        may_hide = (along > 0) & (beside < (_SIDEWAYS * self._reach) ** 2)
-        target, view, hider = np.nonzero(may_hide.transpose(0, 2, 1))
-        pair, image = target * V + view, hider * V + view
-        x, y, z = points.reshape(3, n * V, p)[:, pair] - stand.centres[hider].T[..., None]
-        right, towards = (axes.reshape(-1, 3)[image].T[..., None] for axes in (stand.right, stand.rays))
-        up = np.cross(towards, right, axis=0)
-        across, along, nearer = (x * axis[0] + y * axis[1] + z * axis[2] for axis in (right, up, towards))
-        eye = stand.distance.ravel()[image][:, None]
-        scale = (_PIXELS / (2 * self._reach)) * eye / (eye - nearer)
-        row, column = across * scale + _PIXELS / 2, along * scale + _PIXELS / 2
-        inside = (row >= 0) & (row < _PIXELS) & (column >= 0) & (column < _PIXELS)
-        pixel = row.astype(np.int32) * _PIXELS + column.astype(np.int32)
-        silhouette = stand.nearest.ravel()[image][:, None] * _PIXELS**2
-        front = self._front.ravel().take(silhouette + pixel, mode="clip")
-        hides = inside & (front > nearer + self._clearance)
-        first = np.flatnonzero(np.diff(pair, prepend=-1))
-        hidden.reshape(n * V, p)[pair[first]] |= np.logical_or.reduceat(hides, first, axis=0)
+        up = _square(right, rays)
+        return _Stand(centres, rays, distance, right, up, nearest)
