@@ -20,6 +20,7 @@ setup(
         "active6d_core",
         "active6d_perception",
         "gymnasium",
+        "numba",
         "numpy",
         "pyyaml",
         "safetensors",

@@ -412,9 +412,8 @@ class _Learner:
 
     def _update(self) -> float:
         drawn = [self.memory[i] for i in self.rng.integers(len(self.memory), size=self.parameters.batch)]
-        state = gather([example.state for example in drawn])
         some = self.rng.permutation(len(self.lookup.sphere))[: self.parameters.views]
-        state["views"], state["shown"] = state["views"][some], state["shown"][..., some]
+        state = gather([example.state for example in drawn], some)
         nows, laters = self._trained.explain(state)
         now = _labels([example.now for example in drawn], some, nows.shape[2])
         later = _labels([example.later for example in drawn], some, nows.shape[2])

@@ -23,7 +23,7 @@ import torch
 from torch import nn
 
 from active6d_agent.policy import Decision, Observation, register_policy, weights_path
-from active6d_agent.scene_state import SceneState, best_verified, gather, represent
+from active6d_agent.scene_state import PAIR_FEATURES, SceneState, best_verified, gather, represent
 from active6d_agent.weights_file import load_weights, save_weights
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel
@@ -33,7 +33,6 @@ from active6d_perception.visibility import Tray
 #: Gains are told as objects newly detected, and as the fall of the summed e_ADD over 50 mm.
 GAINS = 2
 _OBJECT_FEATURES = 17
-_PAIR_FEATURES = 12
 _VIEW_FEATURES = 8
 
 
@@ -95,7 +94,7 @@ class ViewAttention(nn.Module):
         self.register_buffer("_axis", None if axis is None else torch.tensor(axis), persistent=False)
         self.of_object = nn.Sequential(nn.Linear(_OBJECT_FEATURES, hidden), nn.ReLU())
         self.in_context = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.ReLU())
-        self.of_pair = nn.Linear(_PAIR_FEATURES, hidden)
+        self.of_pair = nn.Linear(PAIR_FEATURES, hidden)
         self.pair_from_object = nn.Linear(hidden, hidden, bias=False)
         self.pair_from_view = nn.Linear(_VIEW_FEATURES, hidden, bias=False)
         self.mix = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU())
@@ -153,36 +152,11 @@ class ViewAttention(nn.Module):
     def describe(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What is known of (B, n, 17) objects and patches, (B, M, n, 12) pairs and (B, M, 8) views; of the world's
         directions only the vertical counts, but for what the square tray hides."""
-        pose, taken, grid = state["pose"], state["taken"], state["views"]
-        shown, seen = state["shown"], state["seen"]
-        rotation, centre = pose[..., :3], pose[..., 3]
-        B, M = pose.shape[0], grid.shape[0]
-        radius = torch.linalg.vector_norm(taken, dim=-1, keepdim=True)
-        outlook, headings = grid / torch.linalg.vector_norm(grid, dim=-1, keepdim=True), taken / radius
-        # Cameras last, (B, n, 3, K), so that everything between objects and cameras is one long row after another.
-        cameras = torch.cat([grid.expand(B, M, 3), taken], dim=1).transpose(1, 2)
-        rays = cameras[:, None] - centre[..., None]
-        distance = torch.linalg.vector_norm(rays, dim=2)
-        rays /= distance.clamp(min=1e-6)[:, :, None]
-        new = rays[..., :M]
-        from_axis = torch.linalg.vector_norm(centre[..., :2], dim=-1)
-        outward = centre[..., None, :2] / from_axis.clamp(min=1e-6)[..., None, None]
-        turned = rays[..., M:].transpose(2, 3) @ new
-        closest = turned.amax(dim=2).clamp_(-1.0, 1.0)
-        columns = [
-            shown,
-            shown - seen.amax(dim=2, keepdim=True),
-            new[:, :, 2],
-            torch.acos(closest * 0.999999) / np.pi,
-            closest,
-            (seen[..., None] * (1.0 + turned)).amax(dim=2) / 2,
-            distance[..., :M] / radius[:, -1:] - 1.0,
-            (outward @ new[:, :, :2])[:, :, 0],
-            (new * outlook.T).sum(dim=2) - 0.95,
-            *self._sides((rotation.transpose(2, 3) @ new).movedim(2, -1)).unbind(dim=-1),
-        ]
-        pairs = torch.stack(columns, dim=2).permute(0, 3, 1, 2).contiguous()
-        return self._describe_objects(state, from_axis), pairs, self._describe_views(state, outlook, headings)
+        taken, grid, pairs = state["taken"], state["views"], state["pairs"]
+        if self._axis is not None:
+            pairs = torch.cat([pairs[..., :-3], self._sides(pairs[..., -3:])], dim=-1)
+        outlook, headings = (each / torch.linalg.vector_norm(each, dim=-1, keepdim=True) for each in (grid, taken))
+        return self._describe_objects(state), pairs, self._describe_views(state, outlook, headings)
 
     def _sides(self, directions: torch.Tensor) -> torch.Tensor:
         """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
@@ -191,8 +165,9 @@ class ViewAttention(nn.Module):
         axial = directions @ self._axis
         return torch.stack([axial, (1 - axial**2).clamp(min=0.0).sqrt(), torch.zeros_like(axial)], dim=-1)
 
-    def _describe_objects(self, state: dict[str, torch.Tensor], from_axis: torch.Tensor) -> torch.Tensor:
+    def _describe_objects(self, state: dict[str, torch.Tensor]) -> torch.Tensor:
         pose, seen = state["pose"], state["seen"]
+        from_axis = torch.linalg.vector_norm(pose[..., :2, 3], dim=-1)
         # The last view is repeated where others have more.
         own = seen * (torch.arange(seen.shape[2]) <= state["moves"][:, None])[:, None]
         apart = (pose[:, None, :, :, 3] - pose[:, :, None, :, 3]) / self.diameter

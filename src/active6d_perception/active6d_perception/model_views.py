@@ -61,7 +61,8 @@ def _nearest_visible(
     for index in range(len(points)):
         # Most points are near the surface, and what is found within an edge needs no farther search.
         for reach in (min(cells.edge, bound), bound):
-            square, place = _nearest_within(points[index], cells.visible[direction[index]], reach, cells)
+            point = points[index, 0], points[index, 1], points[index, 2]
+            square, place = _nearest_within(point, direction[index], reach, cells)
             if place >= 0:
                 distance[index], found[index] = np.sqrt(square), cells.order[place]
                 break
@@ -69,9 +70,11 @@ def _nearest_visible(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _nearest_within(point: np.ndarray, visible: np.ndarray, reach: float, cells: _Cells) -> tuple[float, int]:
-    """Squared distance and place in the sorted order of the (s,) visible sample nearest to a (3,) point, -1 where none
-    is within ``reach``."""
+def _nearest_within(
+    point: tuple[float, float, float], direction: int, reach: float, cells: _Cells
+) -> tuple[float, int]:
+    """Squared distance and place in the sorted order of the visible sample nearest to a point, -1 where none is within
+    ``reach``."""
     square, best = reach * reach, -1
     x, y, z = point[0] - cells.low[0], point[1] - cells.low[1], point[2] - cells.low[2]
     first, last = _cell(z - reach, 2, cells), _cell(z + reach, 2, cells)
@@ -79,10 +82,11 @@ def _nearest_within(point: np.ndarray, visible: np.ndarray, reach: float, cells:
         for j in range(_cell(y - reach, 1, cells), _cell(y + reach, 1, cells) + 1):
             column = (i * cells.shape[1] + j) * cells.shape[2]
             for place in range(cells.start[column + first], cells.start[column + last + 1]):
-                sample = cells.points[place]
-                dx, dy, dz = point[0] - sample[0], point[1] - sample[1], point[2] - sample[2]
+                dx = point[0] - cells.points[place, 0]
+                dy = point[1] - cells.points[place, 1]
+                dz = point[2] - cells.points[place, 2]
                 # No branches: which sample is visible or nearer, a processor cannot foresee.
-                candidate = dx * dx + dy * dy + dz * dz if visible[place] else np.inf
+                candidate = dx * dx + dy * dy + dz * dz if cells.visible[direction, place] else np.inf
                 best = place if candidate < square else best
                 square = min(square, candidate)
     return square, best
