@@ -60,8 +60,9 @@ class ViewSphere:
 
     def arc(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Great-circle distance in metres between the directions of (..., 3) positions a and b."""
-        a, b = np.asarray(a, float), np.asarray(b, float)
-        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))
+        (ax, ay, az), (bx, by, bz) = (np.moveaxis(np.asarray(each, float), -1, 0) for each in (a, b))
+        x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        angle = np.arctan2(np.sqrt(x * x + y * y + z * z), ax * bx + ay * by + az * bz)
         return self.radius * angle
 
     def path_length(self, positions: np.ndarray) -> float:

@@ -238,7 +238,7 @@ class SceneFusion:
         if not len(order):
             return SceneObjects.empty()
         T, table, stamps = self._T_world_object[order], self._table[order], self._stamp[order]
-        distance = self._distances[np.ix_(order, order)]
+        distance = self._distances.take(order, axis=0).take(order, axis=1)
         labels = cluster(distance, self.parameters.cut * self._diameter)
         weight = evidence(table[:, 0], table[:, 1], self.parameters)
         chosen = select(labels, weight, T[:, :3, 3], self.parameters.exclusion * self._diameter)

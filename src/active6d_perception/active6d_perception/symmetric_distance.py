@@ -1,6 +1,7 @@
 """How far apart two poses of one object are, in closed form, when symmetric poses are the same."""
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from active6d_core.object_model import ObjectModel
 
@@ -35,7 +36,7 @@ class SymmetricDistance:
         # |dt|^2 + 2 dt.(R_a m - R_b m) = |dt + R_a m - R_b m|^2 - |R_a m - R_b m|^2
         mean_a, mean_b = R_a @ self._mean, R_b @ self._mean
         square = 2 * (np.trace(self._moment) - overlap)
-        square += _square_distances(t_a + mean_a, t_b + mean_b) - _square_distances(mean_a, mean_b)
+        square += cdist(t_a + mean_a, t_b + mean_b, "sqeuclidean") - cdist(mean_a, mean_b, "sqeuclidean")
         return np.round(np.sqrt(np.maximum(square, 0.0)) / _RESOLUTION) * _RESOLUTION
 
     def _overlap(self, R_a: np.ndarray, R_b: np.ndarray) -> np.ndarray:
@@ -49,7 +50,3 @@ class SymmetricDistance:
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         around = (RS @ cross.T).reshape(-1, 9) @ R_b.reshape(-1, 9).T
         return along + np.hypot(trace - along, around)
-
-
-def _square_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return ((a[:, None] - b[None]) ** 2).sum(axis=-1)

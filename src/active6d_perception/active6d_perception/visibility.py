@@ -104,7 +104,7 @@ def _shares(
     """
     n, V, p, _ = points.shape
     shares, hidden, outlines = np.empty((n, V)), np.zeros((V, p), np.bool_), np.zeros((V, 3, _LANES), np.float32)
-    nearer, pixel = np.empty(_LANES, np.float32), np.empty(_LANES, np.uint32)
+    nearer, pixel, between = np.empty(_LANES, np.float32), np.empty(_LANES, np.uint32), np.empty(V, np.bool_)
     for target in range(n):
         for view in range(V):
             for index in range(p):
@@ -113,8 +113,9 @@ def _shares(
                 hidden[view, index] = walled(outlines[view, :, index], eyes[view], tray)
         # Views last: neighbouring ones have the same objects in between, which makes the branch foreseeable.
         for hider in range(hiding):
+            _find_between(target, hider, stand, silhouettes.sideways, between)
             for view in range(V):
-                if _is_between(target, hider, view, stand, silhouettes.sideways):
+                if between[view]:
                     _project(outlines, hider, view, stand, silhouettes, nearer, pixel)
                     direction = stand.nearest[hider, view]
                     for index in range(p):
@@ -137,14 +138,15 @@ def walled(point: np.ndarray, eye: np.ndarray, tray: Tray) -> bool:
 
 
 @_compiled
-def _is_between(target: int, hider: int, view: int, stand: _Stand, sideways: np.float32) -> bool:
-    """Whether an object is in front of another, and close to the ray from there to the eye."""
+def _find_between(target: int, hider: int, stand: _Stand, sideways: np.float32, between: np.ndarray) -> None:
+    """Set (V,) ``between`` where an object is in front of another, and close to the ray from there to the eye."""
     x = stand.centres[hider, 0] - stand.centres[target, 0]
     y = stand.centres[hider, 1] - stand.centres[target, 1]
     z = stand.centres[hider, 2] - stand.centres[target, 2]
-    rays = stand.rays
-    along = x * rays[target, view, 0] + y * rays[target, view, 1] + z * rays[target, view, 2]
-    return along > 0 and x * x + y * y + z * z - along * along < sideways * sideways
+    square, rays = x * x + y * y + z * z, stand.rays
+    for view in range(len(between)):
+        along = x * rays[target, view, 0] + y * rays[target, view, 1] + z * rays[target, view, 2]
+        between[view] = (along > np.float32(0)) & (square - along * along < sideways * sideways)
 
 
 @_compiled
@@ -177,6 +179,20 @@ def _project(
         inside = (row >= zero) & (row < pixels) & (column >= zero) & (column < pixels)
         pixel[index] = np.uint32(one + np.floor(row) * pixels + np.floor(column) if inside else zero)
         nearer[index] = depth + silhouettes.clearance
+
+
+@_compiled
+def _look(centres: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n, V, 3) unit vectors from (n, 3) centres to (V, 3) eyes, and (n, V) the distances."""
+    rays, distance = np.empty((len(centres), *eyes.shape), np.float32), np.empty((len(centres), len(eyes)), np.float32)
+    for target, view in np.ndindex(distance.shape):
+        x = eyes[view, 0] - centres[target, 0]
+        y = eyes[view, 1] - centres[target, 1]
+        z = eyes[view, 2] - centres[target, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        distance[target, view] = length
+        rays[target, view, 0], rays[target, view, 1], rays[target, view, 2] = x / length, y / length, z / length
+    return rays, distance
 
 
 @_compiled
@@ -269,9 +285,7 @@ class ExpectedVisibility:
     def _stand(self, T_world_object: np.ndarray, eyes: np.ndarray) -> "_Stand":
         R = T_world_object[:, :3, :3].astype(np.float32)
         centres = T_world_object[:, :3, 3].astype(np.float32)
-        rays = eyes - centres[:, None]
-        distance = np.linalg.norm(rays, axis=-1)
-        rays /= distance[..., None]
+        rays, distance = _look(centres, eyes)
         nearest = ((rays @ R).reshape(-1, 3) @ self._directions.T).argmax(axis=1).reshape(distance.shape)
         # The silhouette is that of the nearest direction, its place in the world is the eye's own: what lies far behind
         # would be shifted otherwise.
