@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from synthetic_bank import synthetic_bank
 
-from active6d_agent import imitation
+from active6d_agent import imitation, scene_state
 from active6d_agent.evaluation import all_starts, observe, run_named, run_policy
 from active6d_agent.lookup import BankLookup
 from active6d_agent.oracle import search_views, tally, worth
@@ -142,6 +142,14 @@ def test_padding_does_not_matter(network, lookup, observation):
         assert not together[2][row][:, n:].any()
 
 
+def test_some_views_are_those_of_all(network, observation):
+    some, state = np.array([70, 3, 41]), states([observation, without_objects(observation, 2)])
+    with torch.inference_mode():
+        everything, chosen = network(gather(state)), network(gather(state, some))
+    for of_all, of_some in zip(everything, chosen, strict=True):
+        np.testing.assert_allclose(of_some, of_all[:, some], atol=1e-4)
+
+
 def test_nothing_is_left_to_gain_after_the_last_move(network, observation):
     assert not values(network, [replace(observation, steps_left=1)])[1].any()
     assert values(network, [observation])[1].any()
@@ -244,6 +252,14 @@ def test_policies_of_one_file_share_its_network_until_it_changes(network, tmp_pa
     after = create_policy("view-attention", lookup.model, weights=str(path)).decide(observation).attention
     assert np.abs(after - before).max() > 1e-3
     np.testing.assert_array_equal(first.decide(observation).attention, before)
+
+
+def test_no_decision_waits_for_the_compiler(policy, observation):
+    decider = policy()
+    compiled = len(scene_state._pair.signatures)
+    assert compiled
+    decider.decide(observation)
+    assert len(scene_state._pair.signatures) == compiled
 
 
 def test_a_decision_leaves_the_threads_as_they_were(policy, observation):

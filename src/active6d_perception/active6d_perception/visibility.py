@@ -20,8 +20,9 @@ from active6d_perception.model_views import ray_caster
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 directions
 _PIXELS = 24  # across a silhouette
-# Points of an object that are looked for, and room for as many as a processor works on at once.
-_POINTS, _LANES = 10, 16
+# Points of an object that are looked for, and how many a loop goes over instead: processors take sixteen at once.
+_POINTS = 10
+_LANES = -(-_POINTS // 16) * 16
 # Farther off the ray than this, in reaches of the model from its origin, no object hides much of another.
 _SIDEWAYS = 1.5
 # Nothing closer in front of a point than this fraction of the diameter hides it: poses are not exact.
