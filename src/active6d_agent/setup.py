@@ -20,7 +20,6 @@ setup(
         "active6d_core",
         "active6d_perception",
         "gymnasium",
-        "numba",
         "numpy",
         "pyyaml",
         "safetensors",

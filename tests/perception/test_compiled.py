@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from active6d_core.camera import DEFAULT_CAMERA
+from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
@@ -98,3 +98,20 @@ def test_silhouettes_hide_what_lies_behind_them():
     np.testing.assert_allclose(visible.shares(T, eyes)[0], shares, atol=1e-12)
     assert min(shares) < 0.3
     assert max(shares) > 0.9
+
+
+def test_what_is_not_a_number_is_nowhere():
+    """Indices are not checked, so it must not become one."""
+    bad = np.array([[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0, -np.inf], [np.nan] * 3, [1e30, -1e30, 0.0]])
+    model = load_object("mug")
+    distance, found = model_views.model_views(model).nearest_visible(bad, np.zeros(len(bad), int), 0.01)
+    assert np.isinf(distance).all()
+    assert (found == -1).all()
+    assert not surface._count(bad.T.astype(np.float32), (5, 4, 3)).any()
+    assert not surface.explainer(model, 0.08).explains(bad, np.eye(4)[None]).any()
+    nowhere = np.full((2, 4, 4), np.nan)
+    assert visibility.expected_visibility(model).shares(nowhere, ViewSphere().positions).shape == (2, 100)
+    depth = np.full((8, 8), 0.5, np.float32)
+    mask = np.ones(depth.shape, np.uint16)
+    lost = Hypotheses(nowhere, np.ones(2), np.full((2, 4), np.nan), np.ones(2), np.ones(2, np.uint16), mask)
+    assert not verification.Verifier(model).score(depth, PinholeCamera(8, 8, 8.0, 8.0, 3.5, 3.5), lost).any()

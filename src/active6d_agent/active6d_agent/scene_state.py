@@ -8,13 +8,13 @@ from :mod:`active6d_perception.visibility`.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
 from active6d_agent.policy import Observation
 from active6d_core.object_model import ObjectModel
+from active6d_perception.compiled import compiled
 from active6d_perception.visibility import Tray, expected_visibility
 
 #: Objects beyond these are left out, the best verified being kept.
@@ -167,7 +167,7 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
     return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _pair(
     pose: np.ndarray,
     shown: np.ndarray,
@@ -217,7 +217,7 @@ def _pair(
                 pairs[row, view, item, 9 + axis] = along
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _length(x: np.float32, y: np.float32, z: np.float32) -> np.float32:
     """Of a vector in metres, a micrometre at the least: nothing has the direction of a zero."""
     return max(np.sqrt(x * x + y * y + z * z), np.float32(1e-6))

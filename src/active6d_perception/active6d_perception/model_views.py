@@ -9,13 +9,13 @@ is at most about 5 degrees from one) that the visible set is the same but for a 
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import open3d as o3d
 import trimesh
 from scipy.spatial import cKDTree
 
 from active6d_core.object_model import ObjectModel
+from active6d_perception.compiled import compiled
 
 _SUBDIVISIONS = 3  # of an icosahedron: 642 directions
 _EYE_DISTANCE = 6.0  # in diameters: 0.8 m for an object of 0.14 m, as on the view hemisphere
@@ -52,7 +52,7 @@ class _Cells(NamedTuple):
     """(m, s) bool, whether a direction sees them"""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _nearest_visible(
     points: np.ndarray, direction: np.ndarray, bound: float, cells: _Cells
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -69,7 +69,7 @@ def _nearest_visible(
     return distance, found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _nearest_within(
     point: tuple[float, float, float], direction: int, reach: float, cells: _Cells
 ) -> tuple[float, int]:
@@ -92,10 +92,10 @@ def _nearest_within(
     return square, best
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _cell(along: float, axis: int, cells: _Cells) -> int:
-    """The nearest cell to a coordinate from the corner, metres."""
-    return int(min(max(along / cells.edge, 0.0), cells.shape[axis] - 1.0))
+    """The nearest cell to a coordinate from the corner, metres; the first one to what is none."""
+    return int(min(along / cells.edge, cells.shape[axis] - 1.0)) if along > 0 else 0
 
 
 class ModelViews:

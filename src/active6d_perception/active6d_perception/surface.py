@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
 
-import numba
 import numpy as np
 
 from active6d_core.camera import PinholeCamera, pixel_rays, project
 from active6d_core.object_model import ObjectModel
+from active6d_perception.compiled import compiled
 from active6d_perception.model_views import ray_caster
 
 # Images are thinned to about this focal length in pixels (every second pixel each way of a VGA image), so that what is
@@ -118,7 +118,7 @@ class SurfaceGrid:
         return slice(low[1], high[1]), slice(low[0], high[0])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _count(along: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """(cells,) how many of (3, k) points, in cells from the grid's corner and NaN where invalid, are in each cell."""
     counts = np.zeros(shape[0] * shape[1] * shape[2], np.int32)
@@ -170,7 +170,7 @@ class Explainer:
         return _look_up(np.ascontiguousarray(np.transpose(points), float), R, origin, self._near)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _look_up(points: np.ndarray, rotation: np.ndarray, origin: np.ndarray, table: np.ndarray) -> np.ndarray:
     """Entries of a table at points that n poses take there.
 

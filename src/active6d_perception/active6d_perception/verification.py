@@ -1,11 +1,11 @@
 """The verification score: how well a hypothesis fits the depth inside its own mask (paper, equation 1)."""
 
-import numba
 import numpy as np
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
+from active6d_perception.compiled import compiled
 from active6d_perception.model_views import ModelViews, model_views
 
 
@@ -109,7 +109,7 @@ class Verifier:
             (n,) flat indices, mask by mask, and (n,) the hypotheses that they belong to.
         """
         height, width = depth.shape
-        corners = np.rint(np.clip(hypotheses.box, 0.0, 1.0) * (width, height, width, height)).astype(int)
+        corners = np.rint(np.clip(np.nan_to_num(hypotheses.box), 0.0, 1.0) * (width, height, width, height)).astype(int)
         images = np.require(hypotheses.segmentation, np.uint16, "CW"), np.require(depth, np.float32, "CW")
         return _pixels_in_boxes(*images, corners, hypotheses.label.astype(np.uint16), self.samples)
 
@@ -135,11 +135,10 @@ def points_and_normals(
     return _points_and_normals(np.require(depth, np.float32, "CW"), intrinsics, np.asarray(pixels), reach)
 
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 _Vector = tuple[float, float, float]
 
 
-@_compiled
+@compiled
 def _pixels_in_boxes(
     segmentation: np.ndarray, depth: np.ndarray, corners: np.ndarray, label: np.ndarray, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -162,7 +161,7 @@ def _pixels_in_boxes(
     return pixels[:total], owner[:total]
 
 
-@_compiled
+@compiled
 def _points_and_normals(
     depth: np.ndarray, intrinsics: tuple[float, float, float, float], pixels: np.ndarray, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -190,7 +189,7 @@ def _points_and_normals(
     return points, normals
 
 
-@_compiled
+@compiled
 def _backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float], u: int, v: int) -> _Vector:
     """The point of one pixel in the optical frame."""
     fx, fy, cx, cy = intrinsics
@@ -198,7 +197,7 @@ def _backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float
     return (u - cx) / fx * z, (v - cy) / fy * z, z
 
 
-@_compiled
+@compiled
 def _tangent(before: _Vector, centre: _Vector, after: _Vector) -> _Vector:
     """Of a surface at the middle one of three points in line, NaN where it has no neighbour."""
     jump_after, jump_before = abs(after[2] - centre[2]), abs(centre[2] - before[2])
@@ -215,7 +214,7 @@ def _tangent(before: _Vector, centre: _Vector, after: _Vector) -> _Vector:
     )
 
 
-@_compiled
+@compiled
 def _into_object_frames(
     points: np.ndarray, normals: np.ndarray, T_camera_object: np.ndarray, owner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

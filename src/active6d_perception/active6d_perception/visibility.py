@@ -9,13 +9,13 @@ no second look, which operations on whole arrays cannot make use of.
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import open3d as o3d
 import trimesh
 from scipy.cluster.vq import kmeans2
 
 from active6d_core.object_model import ObjectModel
+from active6d_perception.compiled import compiled
 from active6d_perception.model_views import ray_caster
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 directions
@@ -27,10 +27,6 @@ _LANES = -(-_POINTS // 16) * 16
 _SIDEWAYS = 1.5
 # Nothing closer in front of a point than this fraction of the diameter hides it: poses are not exact.
 _CLEARANCE = 0.02
-
-
-# Without Python's check of every divisor.
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @lru_cache(maxsize=16)
@@ -86,7 +82,7 @@ class _Silhouettes(NamedTuple):
     """nor what lies less than this behind its surface, metres"""
 
 
-@_compiled
+@compiled
 def _shares(
     points: np.ndarray, eyes: np.ndarray, tray: Tray, stand: _Stand, hiding: int, silhouettes: _Silhouettes
 ) -> np.ndarray:
@@ -126,7 +122,7 @@ def _shares(
     return shares
 
 
-@_compiled
+@compiled
 def walled(point: np.ndarray, eye: np.ndarray, tray: Tray) -> bool:
     """Whether the ray from a (3,) point to an (3,) eye leaves the tray through a wall; all float32."""
     # Along the ray, from 0 at the point to 1 at the eye.
@@ -138,7 +134,7 @@ def walled(point: np.ndarray, eye: np.ndarray, tray: Tray) -> bool:
     return point[2] + leaves * (eye[2] - point[2]) < tray.wall_height
 
 
-@_compiled
+@compiled
 def _find_between(target: int, hider: int, stand: _Stand, sideways: np.float32, between: np.ndarray) -> None:
     """Set (V,) ``between`` where an object is in front of another, and close to the ray from there to the eye."""
     x = stand.centres[hider, 0] - stand.centres[target, 0]
@@ -150,7 +146,7 @@ def _find_between(target: int, hider: int, stand: _Stand, sideways: np.float32, 
         between[view] = (along > np.float32(0)) & (square - along * along < sideways * sideways)
 
 
-@_compiled
+@compiled
 def _project(
     points: np.ndarray,
     hider: int,
@@ -182,7 +178,7 @@ def _project(
         nearer[index] = depth + silhouettes.clearance
 
 
-@_compiled
+@compiled
 def _look(centres: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, V, 3) unit vectors from (n, 3) centres to (V, 3) eyes, and (n, V) the distances."""
     rays, distance = np.empty((len(centres), *eyes.shape), np.float32), np.empty((len(centres), len(eyes)), np.float32)
@@ -196,7 +192,7 @@ def _look(centres: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return rays, distance
 
 
-@_compiled
+@compiled
 def _square(right: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Make (n, V, 3) ``right`` unit vectors square to the rays, in place; (n, V, 3) what is square to both."""
     up = np.empty_like(right)
