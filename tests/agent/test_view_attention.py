@@ -16,7 +16,7 @@ from active6d_agent.evaluation import all_starts, observe, run_named, run_policy
 from active6d_agent.lookup import BankLookup
 from active6d_agent.oracle import search_views, tally, worth
 from active6d_agent.policy import create_policy
-from active6d_agent.scene_state import best_verified, gather, gather_patches, represent
+from active6d_agent.scene_state import best_verified, gather, gather_patches, guess_middle, represent
 from active6d_agent.view_attention import (
     ViewAttention,
     ViewAttentionPolicy,
@@ -170,9 +170,9 @@ def shown_of_items(observation, lookup):
     """Poses of the n objects in the network's order, and what is (n + m, t) seen and (n + m, M) shown."""
     best = observation.objects.take(best_verified(observation)).T_world_object
     model, turn = lookup.model, np.eye(3)
-    below = [0.0, 0.0, 0.25 * model.diameter]
+    surface = observation.unexplained
     guessed = [
-        make_transform(turn, middle - below) for middle in gather_patches(observation.unexplained, model.diameter)[0]
+        make_transform(turn, guess_middle(surface, patch, model)) for patch in gather_patches(surface, model.diameter)
     ]
     visibility, items = expected_visibility(model), np.concatenate([best, guessed])
     tray = Tray.for_model(model)
@@ -418,13 +418,33 @@ def test_patches_are_balls_of_what_is_unexplained():
     rng = np.random.default_rng(0)
     large, small = rng.normal(0, 0.004, (60, 3)), rng.normal(0, 0.004, (20, 3)) + [0.2, 0.0, 0.0]
     lonely = np.array([[0.0, 0.3, 0.0]])
-    middles, sizes = gather_patches(rng.permutation(np.concatenate([small, large, lonely])), 0.1)
-    np.testing.assert_array_equal(sizes, [60, 20])
+    middles = gather_patches(rng.permutation(np.concatenate([small, large, lonely])), 0.1)
     np.testing.assert_allclose(middles, [large.mean(axis=0), small.mean(axis=0)], atol=1e-9)
-    middles, sizes = gather_patches(rng.uniform(-0.3, 0.3, (2000, 3)) * [1, 1, 0], 0.1)
-    assert len(middles) == 8
-    assert (np.diff(sizes) <= 0).all()
-    assert gather_patches(np.zeros((0, 3)), 0.1)[0].shape == (0, 3)
+    assert len(gather_patches(rng.uniform(-0.3, 0.3, (2000, 3)) * [1, 1, 0], 0.1)) == 8
+    assert gather_patches(np.zeros((0, 3)), 0.1).shape == (0, 3)
+
+
+@pytest.mark.parametrize("name", ["bunny", "coffee_cup", "mug"])
+def test_the_middle_is_guessed_behind_the_surface_that_shows(name):
+    """Of objects turned at random that show the third that is nearest to the camera."""
+    model, towards, middle = load_object(name), np.array([0.6, 0.0, 0.8]), np.array([0.3, 0.1, 0.05])
+    points, off = model.mesh.sample(400, seed=0), []
+    for R in Rotation.random(20, random_state=1).as_matrix():
+        depth = points @ R.T @ towards
+        shown = (points @ R.T)[depth > np.quantile(depth, 2 / 3)] + middle
+        patch = shown.mean(axis=0)
+        off.append([np.linalg.norm(each - middle) for each in (guess_middle(shown, patch, model), patch)])
+    guessed, plain = np.mean(off, axis=0) / model.diameter
+    assert guessed < 0.75 * plain
+
+
+def test_unexplained_surface_is_counted_about_every_item(observation, lookup):
+    """Within 0.35 and 0.65 diameters of objects and patches alike, fifty points being one."""
+    state, surface = states([observation])[0], observation.unexplained
+    assert len(surface) > 50
+    for centre, scalars in zip(state.pose[:, :, 3], state.scalars, strict=True):
+        apart = np.linalg.norm(surface - centre, axis=1) / lookup.model.diameter
+        np.testing.assert_allclose(scalars[5:], [(apart < 0.35).sum() / 50, (apart < 0.65).sum() / 50], atol=0.03)
 
 
 def test_explained_gains_are_those_of_the_views(network, observation):
@@ -457,7 +477,7 @@ def test_it_learns_its_way_past_random_and_resumes(tmp_path):
     lookup = BankLookup(synthetic_bank("mug", scenes=3, objects=12))
     starts = all_starts(lookup, 100, 0)
     random = run_named(lookup, "random", starts, 4)
-    settings = {"episodes": 10, "updates": 20, "longest": 4, "steps": 4, "starts": 100, "batch": 48}
+    settings = {"episodes": 10, "updates": 60, "longest": 4, "steps": 4, "starts": 100, "batch": 48}
     parameters = imitation.ImitationParameters(rounds=4, evaluate_every=2, **settings)
     curve = list(imitation.imitate(lookup, lookup, tmp_path, parameters, Weighing(metres_weight=0.05)))
     assert [progress.round for progress in curve] == [2, 4]

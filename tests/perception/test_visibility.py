@@ -3,12 +3,13 @@
 import numpy as np
 import open3d as o3d
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
-from active6d_core.object_model import load_object
+from active6d_core.object_model import ObjectModel, Symmetry, load_object
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.visibility import OPEN_TABLE, Tray, expected_visibility, walled
+from active6d_perception.visibility import OPEN_TABLE, ExpectedVisibility, Tray, expected_visibility, walled
 
 NAMES = ("mug", "bunny", "coffee_cup")
 
@@ -55,14 +56,24 @@ def test_shares_are_those_of_a_rendering(name):
     assert np.corrcoef(told, expected)[0, 1] > 0.96
 
 
-def test_an_object_alone_is_seen_whole_and_one_right_behind_another_is_not():
-    model = load_object("bunny")
-    low, high = make_transform(np.eye(3), np.zeros(3)), make_transform(np.eye(3), [0.0, 0.0, 0.2])
-    above, aside = np.array([[0.0, 0.0, 0.8], [0.8, 0.0, 0.1]])
-    shares = expected_visibility(model).shares(np.stack([low, high]), np.stack([above, aside]))
-    np.testing.assert_array_equal(shares[:, 1], 1.0)
-    assert shares[0, 0] == 0.0
+@pytest.fixture(scope="module")
+def ball():
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    symmetry = Symmetry(None, np.eye(3)[None])
+    return ExpectedVisibility(ObjectModel("ball", mesh, 0.1, symmetry, (1, 1), np.ones(3), {}))
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.1, 0.12])
+def test_balls_hide_as_much_as_circles_overlap(ball, aside):
+    """From far away, one ball shows all but the lens in which the two circles lie over each other."""
+    low, high = (make_transform(np.eye(3), [x, 0.0, z]) for x, z in ((0.0, 0.0), (aside, 0.2)))
+    above = np.array([[0.0, 0.0, 100.0], [0.0, 100.0, 0.0]])
+    shares = ball.shares(np.stack([low, high]), above)
+    half = min(aside / 0.1, 1.0)
+    lens = 2 / np.pi * (np.arccos(half) - half * np.sqrt(1 - half**2))
+    np.testing.assert_allclose(shares[0, 0], 1 - lens, atol=0.08)
     assert shares[1, 0] == 1.0
+    np.testing.assert_array_equal(shares[:, 1], 1.0)
 
 
 def test_only_those_that_hide_hide():

@@ -306,7 +306,7 @@ def candidate_gains(
         known(lookup, np.full(len(free), scene), each) for each in (paths, spread(lookup.sphere, paths, left - 1))
     )
     rows = lookup.fuse(np.array([scene]), views[None], views[-1:]).objects[0]
-    column, stands_for = _stand_for(lookup, scene, rows, patches)
+    column, stands_for = stand_for(lookup, scene, rows, patches)
     count = min(len(rows), MAX_OBJECTS) + len(patches)
     gains = np.full((2, len(lookup.sphere), count + 1, GAINS), np.nan)
     gains[:, free] = 0.0
@@ -316,7 +316,7 @@ def candidate_gains(
     return gains[0], gains[1]
 
 
-def _stand_for(lookup: BankLookup, scene: int, rows: np.ndarray, patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def stand_for(lookup: BankLookup, scene: int, rows: np.ndarray, patches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Items that stand for true objects, and those objects: an accumulated object, of the hypotheses ``rows``, for the
     one that it is best for; a patch for the nearest that no accumulated object stands for."""
     order = np.argsort(-lookup.verification[rows], kind="stable")

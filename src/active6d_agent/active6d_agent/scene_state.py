@@ -7,6 +7,7 @@ from :mod:`active6d_perception.visibility`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from scipy.spatial.distance import cdist
 from active6d_agent.policy import Observation
 from active6d_core.object_model import ObjectModel
 from active6d_perception.compiled import compiled
+from active6d_perception.model_views import model_views
 from active6d_perception.visibility import Tray, expected_visibility
 
 #: Objects beyond these are left out, the best verified being kept.
@@ -28,10 +30,18 @@ _PATCH_RADIUS = 0.45
 _FEWEST_POINTS = 4
 # More points than these are thinned out.
 _MOST_POINTS = 240
-# A patch of this many points has size one.
-_POINTS_OF_SIZE_ONE = 50
-# Where the middle of an object is guessed to be below the middle of its patch, in diameters.
-_BELOW_SURFACE = 0.25
+# Unexplained surface is counted within these distances of an item's middle, in diameters, and so many points are one.
+_NEAR_MIDDLE = (0.35, 0.65)
+_POINTS_OF_ONE = 50
+# Where the middle of an object is looked for about the middle of its patch, in diameters: most of it is below.
+_PLACES = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 5)] * 2, np.linspace(-0.5, 0.1, 4)), axis=-1).reshape(-1, 3)
+# Surface within this distance has a vote in that, in diameters, but no more points than these.
+_VOTERS_WITHIN = 0.7
+_MOST_VOTERS = 60
+# Standard deviation of the surface's distance from the middle that votes allow for, in diameters.
+_SHELL = 0.12
+# A twentieth of all votes more makes a place e times as likely.
+_SHARPNESS = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +50,8 @@ class SceneState:
 
     Attributes:
         pose: (n, 3, 4) in the world; a patch has the guessed middle of its object, and zeros for a rotation.
-        scalars: (n, 6) verification, score, spread in metres, share of the views that support the object; 1 for a patch
-            and its size.
+        scalars: (n, 7) verification, score, spread in metres, share of the views that support the object; 1 for a
+            patch; unexplained surface near the middle and farther about it, of which right poses leave little.
         shown: (n, M) share that each view of the grid would show past the objects in between.
         seen: (n, t) the same of the views taken.
         taken: (t, 3) positions of the camera, the current one last.
@@ -68,7 +78,7 @@ def best_verified(observation: Observation) -> np.ndarray:
     return np.argsort(-observation.objects.verification, kind="stable")[:MAX_OBJECTS]
 
 
-def gather_patches(points: np.ndarray, diameter: float) -> tuple[np.ndarray, np.ndarray]:
+def gather_patches(points: np.ndarray, diameter: float) -> np.ndarray:
     """The densest balls of unexplained points, one after the other.
 
     Args:
@@ -76,42 +86,69 @@ def gather_patches(points: np.ndarray, diameter: float) -> tuple[np.ndarray, np.
         diameter: of an object.
 
     Returns:
-        (m, 3) middles of the patches and (m,) their numbers of points.
+        (m, 3) middles of the patches.
     """
     thinning = max(1, -(-len(points) // _MOST_POINTS))
     points = points[::thinning]
     near = cdist(points, points) < _PATCH_RADIUS * diameter
-    middles, sizes, free = [], [], np.ones(len(points), bool)
+    middles, free = [], np.ones(len(points), bool)
     while len(middles) < MAX_PATCHES and free.any():
         count = near @ free.astype(np.float32) * free
         members = near[count.argmax()] & free
-        size = members.sum() * thinning
-        if size < _FEWEST_POINTS:
+        if members.sum() * thinning < _FEWEST_POINTS:
             break
         middles.append(points[members].mean(axis=0))
-        sizes.append(size)
         free &= ~members
-    return np.reshape(middles, (-1, 3)), np.array(sizes, float)
+    return np.reshape(middles, (-1, 3))
+
+
+def guess_middle(points: np.ndarray, patch: np.ndarray, model: ObjectModel) -> np.ndarray:
+    """Where the middle of an object is likely to be, given surface of it.
+
+    Every point about the patch votes for the places that are as far from it as an object's surface mostly is from its
+    middle; the answer is the mean of all places, weighted by how many agree on them (a Hough transform, softened).
+
+    Args:
+        points: (k, 3) unexplained surface, metres.
+        patch: (3,) middle of some of it.
+        model: of the object.
+    """
+    near = points[np.linalg.norm(points - patch, axis=1) < _VOTERS_WITHIN * model.diameter]
+    near = near[:: max(1, -(-len(near) // _MOST_VOTERS))]
+    places = patch + _PLACES * model.diameter
+    off_surface = (cdist(places, near) - _middle_radius(model)) / (_SHELL * model.diameter)
+    votes = np.exp(-0.5 * off_surface**2).mean(axis=1)
+    weight = np.exp(_SHARPNESS * (votes - votes.max()))
+    return weight @ places / weight.sum()
+
+
+@lru_cache(maxsize=16)
+def _middle_radius(model: ObjectModel) -> float:
+    """How far half of an object's surface is from its origin, metres."""
+    return float(np.median(np.linalg.norm(model_views(model).points, axis=1)))
 
 
 def represent(observation: Observation, model: ObjectModel, tray: Tray | None = None) -> SceneState:
     """Everything that the network is told of an observation of objects in a tray, the usual one when None."""
     objects, t = observation.objects, len(observation.positions)
     best = best_verified(observation)
-    patches, sizes = gather_patches(observation.unexplained, model.diameter)
-    n, m = len(best), len(sizes)
+    unexplained = observation.unexplained
+    patches = gather_patches(unexplained, model.diameter)
+    n, m = len(best), len(patches)
     T_world_item = np.tile(np.eye(4), (n + m, 1, 1))
     T_world_item[:n] = objects.T_world_object[best]
-    # Most of an object lies below the surface that shows. Which way it is turned is anybody's guess.
-    T_world_item[n:, :3, 3] = patches - [0.0, 0.0, _BELOW_SURFACE * model.diameter]
+    T_world_item[n:, :3, 3] = np.reshape([guess_middle(unexplained, patch, model) for patch in patches], (m, 3))
     grid = observation.sphere.positions
     eyes = np.concatenate([grid, observation.positions])
     shares = expected_visibility(model).shares(T_world_item, eyes, tray or Tray.for_model(model), hiding=n)
-    pose, scalars = T_world_item[:, :3].astype(np.float32), np.zeros((n + m, 6), np.float32)
+    pose, scalars = T_world_item[:, :3].astype(np.float32), np.zeros((n + m, 7), np.float32)
     pose[n:, :, :3] = 0.0
     columns = objects.verification, objects.score, objects.spread, objects.support / t
     scalars[:n, :4] = np.column_stack(columns)[best]
-    scalars[n:, 4], scalars[n:, 5] = 1.0, sizes / _POINTS_OF_SIZE_ONE
+    scalars[n:, 4] = 1.0
+    apart = cdist(T_world_item[:, :3, 3], unexplained)
+    for column, within in enumerate(_NEAR_MIDDLE, start=5):
+        scalars[:, column] = (apart < within * model.diameter).sum(axis=1) / _POINTS_OF_ONE
     return SceneState(
         pose,
         scalars,
@@ -131,7 +168,7 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
         views: (M,) those in question, all of the grid when None.
 
     Returns:
-        ``pose`` (B, n, 3, 4), ``scalars`` (B, n, 6), ``shown`` (B, n, M), ``seen`` (B, n, t) whose last column repeats
+        ``pose`` (B, n, 3, 4), ``scalars`` (B, n, 7), ``shown`` (B, n, M), ``seen`` (B, n, t) whose last column repeats
         the current view, ``present`` (B, n), ``taken`` (B, t, 3) likewise, ``moves`` (B,) moves made, ``left`` (B,)
         moves left, ``views`` (M, 3), ``pairs`` (B, M, n, 12) what is known of each object and each view: the share that
         the view would show, how much that is above what was seen, how steeply the view looks down on the object, the
@@ -146,7 +183,7 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
     B, M = len(states), len(grid)
     arrays = {
         "pose": np.zeros((B, count, 3, 4), np.float32),
-        "scalars": np.zeros((B, count, 6), np.float32),
+        "scalars": np.zeros((B, count, 7), np.float32),
         "shown": np.zeros((B, count, M), np.float32),
         "seen": np.zeros((B, count, longest), np.float32),
         "present": np.zeros((B, count), bool),

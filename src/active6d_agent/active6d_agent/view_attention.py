@@ -32,7 +32,7 @@ from active6d_perception.visibility import Tray
 
 #: Gains are told as objects newly detected, and as the fall of the summed e_ADD over 50 mm.
 GAINS = 2
-_OBJECT_FEATURES = 17
+_OBJECT_FEATURES = 18
 _VIEW_FEATURES = 8
 
 
@@ -150,7 +150,7 @@ class ViewAttention(nn.Module):
         return _Seen(e, total, whole, attention, mask)
 
     def describe(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What is known of (B, n, 17) objects and patches, (B, M, n, 12) pairs and (B, M, 8) views; of the world's
+        """What is known of (B, n, 18) objects and patches, (B, M, n, 12) pairs and (B, M, 8) views; of the world's
         directions only the vertical counts, but for what the square tray hides."""
         taken, grid, pairs = state["taken"], state["views"], state["pairs"]
         if self._axis is not None:
@@ -172,14 +172,15 @@ class ViewAttention(nn.Module):
         own = seen * (torch.arange(seen.shape[2]) <= state["moves"][:, None])[:, None]
         apart = (pose[:, None, :, :, 3] - pose[:, :, None, :, 3]) / self.diameter
         near = torch.exp(-(apart**2).sum(dim=-1)) * state["present"][:, None]
-        verification, score, spread, support, patch, size = state["scalars"].unbind(dim=-1)
+        verification, score, spread, support, patch, surface_near, surface_around = state["scalars"].unbind(dim=-1)
         columns = [
             verification,
             score,
             (spread / self.diameter).clamp_(max=1.0),
             support,
             patch,
-            size,
+            surface_near,
+            surface_around,
             pose[..., 2, 3] / self.diameter,
             from_axis / (2 * self.diameter),
             near.sum(dim=-1) / 3,

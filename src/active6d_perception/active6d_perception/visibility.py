@@ -1,9 +1,11 @@
 """How much of every known object a camera would see from places where it has not been.
 
-Objects hide each other. For a few points of each object's outline as a view sees it, the silhouettes of the objects
-between say whether they are hidden there. Silhouettes are looked up among those of directions all around the model,
-which takes a small part of the time that rendering a hundred views would. The look-up is compiled: what is hidden needs
-no second look, which operations on whole arrays cannot make use of.
+Objects hide each other. For points spread over an object's outline, the silhouettes of the objects between say whether
+they are hidden. Silhouettes are looked up among those of directions all around the model, which takes a small part of
+the time that rendering a hundred views would.
+
+The outline is the mean of all directions' outlines, whichever way the object is turned: what needs another view has a
+hypothesis that is wrong, or none, and of it this tells more than the outline of a wrong pose does.
 """
 
 from functools import lru_cache
@@ -12,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import open3d as o3d
 import trimesh
-from scipy.cluster.vq import kmeans2
 
 from active6d_core.object_model import ObjectModel
 from active6d_perception.compiled import compiled
@@ -20,9 +21,8 @@ from active6d_perception.model_views import ray_caster
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 directions
 _PIXELS = 24  # across a silhouette
-# Points of an object that are looked for, and how many a loop goes over instead: processors take sixteen at once.
-_POINTS = 10
-_LANES = -(-_POINTS // 16) * 16
+# Points of an object that are looked for, a multiple of sixteen: so many processors work on at once.
+_POINTS = 32
 # Farther off the ray than this, in reaches of the model from its origin, no object hides much of another.
 _SIDEWAYS = 1.5
 # Nothing closer in front of a point than this fraction of the diameter hides it: poses are not exact.
@@ -84,12 +84,12 @@ class _Silhouettes(NamedTuple):
 
 @compiled
 def _shares(
-    points: np.ndarray, eyes: np.ndarray, tray: Tray, stand: _Stand, hiding: int, silhouettes: _Silhouettes
+    disc: np.ndarray, eyes: np.ndarray, tray: Tray, stand: _Stand, hiding: int, silhouettes: _Silhouettes
 ) -> np.ndarray:
     """What is left of objects' outlines; all numbers are float32.
 
     Args:
-        points: (n, V, p, 3) of the outlines that the eyes see, from the objects' centres, world.
+        disc: (3, p) points of any outline: along the silhouette's rows, its columns and towards the eye, metres.
         eyes: (V, 3) world.
         tray: walls.
         stand: of the objects.
@@ -99,15 +99,11 @@ def _shares(
     Returns:
         (n, V) shares of the points that neither a wall nor another object hides.
     """
-    n, V, p, _ = points.shape
-    shares, hidden, outlines = np.empty((n, V)), np.zeros((V, p), np.bool_), np.zeros((V, 3, _LANES), np.float32)
-    nearer, pixel, between = np.empty(_LANES, np.float32), np.empty(_LANES, np.uint32), np.empty(V, np.bool_)
+    (n, V), p = stand.nearest.shape, _POINTS
+    shares, hidden, outlines = np.empty((n, V)), np.zeros((V, p), np.bool_), np.zeros((V, 3, p), np.float32)
+    nearer, pixel, between = np.empty(p, np.float32), np.empty(p, np.uint32), np.empty(V, np.bool_)
     for target in range(n):
-        for view in range(V):
-            for index in range(p):
-                for axis in range(3):
-                    outlines[view, axis, index] = points[target, view, index, axis] + stand.centres[target, axis]
-                hidden[view, index] = walled(outlines[view, :, index], eyes[view], tray)
+        _outline(target, disc, eyes, tray, stand, outlines, hidden)
         # Views last: neighbouring ones have the same objects in between, which makes the branch foreseeable.
         for hider in range(hiding):
             _find_between(target, hider, stand, silhouettes.sideways, between)
@@ -120,6 +116,28 @@ def _shares(
         for view in range(V):
             shares[target, view] = 1.0 - hidden[view].sum() / p
     return shares
+
+
+@compiled
+def _outline(
+    target: int,
+    disc: np.ndarray,
+    eyes: np.ndarray,
+    tray: Tray,
+    stand: _Stand,
+    outlines: np.ndarray,
+    hidden: np.ndarray,
+) -> None:
+    """Set (V, 3, p) ``outlines`` to the points that the eyes look for, and (V, p) ``hidden`` where walls hide them."""
+    for view in range(len(eyes)):
+        for axis in range(3):
+            right, up = stand.right[target, view, axis], stand.up[target, view, axis]
+            centre, ray = stand.centres[target, axis], stand.rays[target, view, axis]
+            for index in range(_POINTS):
+                beside = right * disc[0, index] + up * disc[1, index] + ray * disc[2, index]
+                outlines[view, axis, index] = centre + beside
+        for index in range(_POINTS):
+            hidden[view, index] = walled(outlines[view, :, index], eyes[view], tray)
 
 
 @compiled
@@ -167,7 +185,7 @@ def _project(
     ray_x, ray_y, ray_z = stand.rays[hider, view, 0], stand.rays[hider, view, 1], stand.rays[hider, view, 2]
     distance, pixels = stand.distance[hider, view], np.float32(_PIXELS)
     zero, one, middle = np.float32(0), np.float32(1), np.float32(_PIXELS / 2)
-    for index in range(_LANES):
+    for index in range(_POINTS):
         x, y, z = points[view, 0, index] - x0, points[view, 1, index] - y0, points[view, 2, index] - z0
         depth = x * ray_x + y * ray_y + z * ray_z
         scale = silhouettes.pixels_per_metre * distance / (distance - depth)
@@ -231,8 +249,7 @@ class ExpectedVisibility:
             np.float32(_SIDEWAYS * self._reach),
             np.float32(_CLEARANCE * model.diameter),
         )
-        # (m, p, 3): points of each direction's outline, in the object's frame.
-        self._points = np.stack([self._spread_points(*pair) for pair in zip(frames, front, strict=True)])
+        self._disc = self._spread_points(front)
         # Now, so that no decision waits for the compiler.
         self.shares(np.eye(4)[None], np.array([[0.0, 0.0, 4 * self._reach]]))
 
@@ -248,13 +265,21 @@ class ExpectedVisibility:
     def _pixel_centres(self) -> np.ndarray:
         return ((np.arange(_PIXELS) + 0.5) / _PIXELS * 2 - 1) * self._reach
 
-    def _spread_points(self, frame: np.ndarray, front: np.ndarray) -> np.ndarray:
-        """(p, 3) points of the visible surface, spread evenly over the silhouette, object frame."""
-        pixels = np.argwhere(np.isfinite(front))
-        centres = kmeans2(pixels.astype(float), _POINTS, minit="++", seed=0)[0]
-        row, column = pixels[((pixels[:, None] - centres) ** 2).sum(axis=-1).argmin(axis=0)].T
-        seen = np.column_stack([self._pixel_centres[row], self._pixel_centres[column], front[row, column]])
-        return (seen @ frame).astype(np.float32)
+    def _spread_points(self, front: np.ndarray) -> np.ndarray:
+        """(3, p) points spread over the mean of all silhouettes, at the mean depth of what is there."""
+        seen = np.isfinite(front)
+        covered = seen.mean(axis=0)
+        height = np.where(seen, front, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+        radius = np.hypot(*np.meshgrid(self._pixel_centres, self._pixel_centres))
+        order = np.argsort(radius, axis=None)
+        inner = np.cumsum(covered.ravel()[order])
+        # A sunflower's seeds, each for as much of the silhouette as every other.
+        seed = np.arange(_POINTS)
+        r = np.interp((seed + 0.5) / _POINTS, inner / inner[-1], radius.ravel()[order])
+        near = covered * np.exp(-((radius - r[:, None, None]) ** 2) * (_PIXELS / (2 * self._reach)) ** 2)
+        towards = (near * height).sum(axis=(1, 2)) / near.sum(axis=(1, 2))
+        angle = seed * np.pi * (3 - np.sqrt(5))
+        return np.stack([r * np.cos(angle), r * np.sin(angle), towards]).astype(np.float32)
 
     def shares(
         self, T_world_object: np.ndarray, eyes: np.ndarray, tray: Tray | None = None, hiding: int | None = None
@@ -272,12 +297,9 @@ class ExpectedVisibility:
         """
         eyes = np.ascontiguousarray(eyes, np.float32)
         stand = self._stand(T_world_object, eyes)
-        n, V = stand.nearest.shape
-        points = self._points.take(stand.nearest, axis=0).reshape(n, V * _POINTS, 3)
-        points = points @ T_world_object[:, :3, :3].transpose(0, 2, 1).astype(np.float32)
-        points = points.reshape(n, V, _POINTS, 3)
         walls = Tray(*np.float32(OPEN_TABLE if tray is None else tray))
-        return _shares(points, eyes, walls, stand, n if hiding is None else hiding, self._silhouettes)
+        hiding = len(T_world_object) if hiding is None else hiding
+        return _shares(self._disc, eyes, walls, stand, hiding, self._silhouettes)
 
     def _stand(self, T_world_object: np.ndarray, eyes: np.ndarray) -> "_Stand":
         R = T_world_object[:, :3, :3].astype(np.float32)
