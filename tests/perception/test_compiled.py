@@ -87,7 +87,8 @@ def test_silhouettes_hide_what_lies_behind_them():
         right /= np.linalg.norm(right)
         frame = np.stack([right, np.cross(towards, right), towards])
         assert stand.nearest[1, view] == nearest
-        points = visible._points[stand.nearest[0, view]]
+        axes = stand.right[0, view], stand.up[0, view], eye / np.linalg.norm(eye)
+        points = visible._disc.T @ np.stack(axes)
         across, along, nearer = frame @ (points - T[1, :3, 3]).T
         distance = np.linalg.norm(eye - T[1, :3, 3])
         row, column = np.array([across, along]) * silhouettes.pixels_per_metre * distance / (distance - nearer) + 12
