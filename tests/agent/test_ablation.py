@@ -11,7 +11,7 @@ from active6d_agent.environment import RewardParameters
 from active6d_agent.evaluation import all_starts, run_named
 from active6d_agent.lookup import BankLookup
 from active6d_agent.train import TrainingParameters
-from active6d_agent.view_attention import new_network, save_network
+from active6d_agent.view_attention import ViewAttention, save_network
 from active6d_core.metrics import evaluate_scene
 from active6d_perception.fusion import RANKINGS
 
@@ -92,7 +92,7 @@ def test_variants_are_trained_once(lookup, starts, tmp_path):
 
 def test_planning_varies_one_parameter_of_the_default_policy(lookup, starts, tmp_path, monkeypatch):
     weights = tmp_path / "untrained.safetensors"
-    save_network(new_network(lookup.model), weights, "mug")
+    save_network(ViewAttention(), weights, "mug")
     monkeypatch.setattr(ablation, "PLANNING", {"metres_weight": (0.0, 100.0), "stop_below": (1e6,)})
     made = list(ablation.ablate_planning(lookup, starts, 3, parameters={"weights": str(weights)}))
     assert [(name, value) for name, value, _ in made] == [

@@ -21,7 +21,6 @@ from active6d_agent.view_attention import (
     ViewAttention,
     ViewAttentionPolicy,
     Weighing,
-    new_network,
     save_network,
     trace,
     value_views,
@@ -39,7 +38,7 @@ def lookup():
 @pytest.fixture(scope="module")
 def network(lookup):
     torch.manual_seed(0)
-    return new_network(lookup.model).eval()
+    return ViewAttention().eval()
 
 
 @pytest.fixture
@@ -94,7 +93,7 @@ def test_turning_the_world_about_the_vertical_turns_the_values(name, observation
     """By a quarter, for the tray is square: the value of a view moves on to the view five further. Without patches, as
     what stands in for them does not turn with the world."""
     torch.manual_seed(1)
-    network = new_network(load_object(name)).eval()
+    network = ViewAttention().eval()
     turn = Rotation.from_euler("z", np.pi / 2).as_matrix()
     observation = replace(observation, unexplained=np.zeros((0, 3)))
     T = make_transform(turn, np.zeros(3)) @ observation.objects.T_world_object
@@ -113,7 +112,7 @@ def test_turning_the_world_about_the_vertical_turns_the_values(name, observation
 def test_turning_a_cup_about_its_axis_does_not_matter(observation):
     cup = load_object("coffee_cup")
     torch.manual_seed(2)
-    network = new_network(cup).eval()
+    network = ViewAttention().eval()
     spin = make_transform(Rotation.from_rotvec(1.1 * cup.symmetry.axis).as_matrix(), np.zeros(3))
     spun = replace(
         observation, objects=replace(observation.objects, T_world_object=observation.objects.T_world_object @ spin)
@@ -157,7 +156,7 @@ def test_nothing_is_left_to_gain_after_the_last_move(network, observation):
 
 def test_pairs_begin_with_what_views_show(network, observation, lookup):
     """Of objects and of what patches are guessed to be, and how much more that is than the best view has shown."""
-    _, pairs, _ = network.describe(gather(states([observation])))
+    pairs = gather(states([observation]))["pairs"]
     best, seen, shown = shown_of_items(observation, lookup)
     n = len(best)
     assert len(shown) > n
@@ -184,7 +183,7 @@ def shown_of_items(observation, lookup):
 
 def test_pairs_are_what_geometry_says(network, observation, lookup):
     """Columns 2 to 11, one pair at a time, by their definitions."""
-    _, pairs, _ = network.describe(gather(states([observation])))
+    pairs = gather(states([observation]))["pairs"]
     grid, taken = lookup.sphere.positions, observation.positions
     best, seen, _ = shown_of_items(observation, lookup)
     for view, index in [(0, 0), (25, 3), (60, 1), (99, len(best) - 1)]:
@@ -211,7 +210,7 @@ def test_the_network_is_what_its_layers_say(network, lookup, observation):
     state = gather(states([observation, fewer]))
     with torch.inference_mode():
         now, later, attention = network(state)
-        objects, pairs, views = network.describe(state)
+        objects, pairs, views = state["items"], state["pairs"], state["outlooks"]
         for row, view in [(0, 0), (0, 77), (1, 30)]:
             n = int(state["present"][row].sum())
             h = network.of_object(objects[row, :n])
@@ -512,7 +511,7 @@ def test_the_weighing_is_the_best_that_is_not_longer_than_random(lookup, network
 
 
 def replace_weighing(network, weighing):
-    changed = ViewAttention(network.diameter, network.axis)
+    changed = ViewAttention()
     changed.load_state_dict(network.state_dict())
     changed.weighing = weighing
     return changed.eval()

@@ -124,7 +124,6 @@ def untrained(tmp_path_factory):
     import torch
 
     from active6d_agent import attention, view_attention
-    from active6d_core.object_model import load_object
 
     folder = tmp_path_factory.mktemp("policies")
     for seed in range(3):
@@ -134,7 +133,7 @@ def untrained(tmp_path_factory):
             if name == "attention":
                 attention.save_network(attention.AttentionNetwork(2), own / "best.safetensors")
             else:
-                network = view_attention.new_network(load_object("mug"))
+                network = view_attention.ViewAttention()
                 view_attention.save_network(network, own / "best.safetensors", "mug")
             (own / "curve.jsonl").write_text(json.dumps({"seconds": 90.0}) + "\n")
     return folder

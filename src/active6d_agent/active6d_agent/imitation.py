@@ -26,7 +26,6 @@ from active6d_agent.view_attention import (
     ViewAttention,
     Weighing,
     load_network,
-    new_network,
     save_network,
     value_views,
 )
@@ -342,7 +341,7 @@ class _Learner:
     def __init__(self, lookup: BankLookup, parameters: ImitationParameters, weighing: Weighing) -> None:
         torch.manual_seed(parameters.seed)
         self.lookup, self.parameters, self._weighing = lookup, parameters, weighing
-        self._trained = new_network(lookup.model, parameters.hidden)
+        self._trained = ViewAttention(parameters.hidden)
         self.optimizer = torch.optim.Adam(self._trained.parameters(), parameters.learning_rate, weight_decay=1e-5)
         # What plays and is kept is a running mean of the weights: it does better on other scenes than the latest.
         self._average = AveragedModel(self._trained, avg_fn=_running_mean).eval()

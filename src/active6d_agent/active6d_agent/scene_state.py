@@ -7,7 +7,7 @@ from :mod:`active6d_perception.visibility`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -23,8 +23,8 @@ from active6d_perception.visibility import Tray, expected_visibility
 MAX_OBJECTS = 64
 #: Patches beyond these are left out, the largest being kept.
 MAX_PATCHES = 8
-#: What is known of an object and a view, see :func:`gather`.
-PAIR_FEATURES = 12
+#: What is known of an item, of an item and a view, and of a view, see :class:`SceneState` and :func:`gather`.
+ITEM_FEATURES, PAIR_FEATURES, VIEW_FEATURES = 18, 12, 8
 # Points of surface within this fraction of the diameter are one patch, and so many are needed.
 _PATCH_RADIUS = 0.45
 _FEWEST_POINTS = 4
@@ -57,6 +57,8 @@ class SceneState:
         taken: (t, 3) positions of the camera, the current one last.
         grid: (M, 3) positions of the views.
         left: moves left.
+        diameter: of an object.
+        axis: (3,) of its continuous symmetry, object frame, zeros without one.
     """
 
     pose: np.ndarray
@@ -66,11 +68,67 @@ class SceneState:
     taken: np.ndarray
     grid: np.ndarray
     left: int
+    diameter: float
+    axis: np.ndarray
 
     @property
     def patches(self) -> np.ndarray:
         """(m, 3) where the middles of the patches' objects are guessed to be."""
         return self.pose[self.scalars[:, 4] > 0, :, 3]
+
+    @cached_property
+    def items(self) -> np.ndarray:
+        """(n, 18) float32, what is known of each by itself; of the world's directions only the vertical counts."""
+        verification, score, spread, *rest = self.scalars.T
+        centre, upright = self.pose[:, :, 3], self.pose[:, 2, :3]
+        apart = (centre - centre[:, None]) / self.diameter
+        near = np.exp(-(apart**2).sum(axis=-1))
+        moves = np.full(len(centre), self._few(len(self.taken) - 1))
+        columns = [
+            verification,
+            score,
+            np.minimum(spread / self.diameter, 1.0),
+            *rest,
+            centre[:, 2] / self.diameter,
+            np.linalg.norm(centre[:, :2], axis=1) / (2 * self.diameter),
+            near.sum(axis=1) / 3,
+            (near * np.maximum(apart[..., 2], 0.0)).sum(axis=1),
+            self.seen.max(axis=1),
+            self.seen[:, -1],
+            self.seen.sum(axis=1) / 3,
+            moves,
+            *self._sides(upright).T,
+        ]
+        return np.stack(columns, axis=1).astype(np.float32)
+
+    @cached_property
+    def outlooks(self) -> np.ndarray:
+        """(M, 8) float32, what is known of each view by itself: its height and the camera's, the ways to it from the
+        camera and from the nearest view taken, moves made and left, the number of items, and how near the end is."""
+        outlook, heading = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (self.grid, self.taken))
+        # Just off the ends, where the angle has no derivative.
+        arcs = np.arccos((outlook @ heading.T).clip(-1.0, 1.0) * np.float32(0.999999)) / np.float32(np.pi)
+        moves, left = self._few(len(self.taken) - 1), self._few(self.left)
+        known = np.empty((len(outlook), VIEW_FEATURES), np.float32)
+        known[:, 0], known[:, 1], known[:, 2], known[:, 3] = (
+            outlook[:, 2],
+            heading[-1, 2],
+            arcs[:, -1],
+            arcs.min(axis=1),
+        )
+        known[:, 4:] = moves, left, len(self.pose) / 20, 1 / (1 + 5 * left)
+        return known
+
+    @staticmethod
+    def _few(moves: int) -> float:
+        return min(moves / 5, 2.0)
+
+    def _sides(self, directions: np.ndarray) -> np.ndarray:
+        """(n, 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
+        if not self.axis.any():
+            return directions
+        axial = directions @ self.axis
+        return np.stack([axial, np.sqrt(np.maximum(1 - axial**2, 0.0)), np.zeros_like(axial)], axis=-1)
 
 
 def best_verified(observation: Observation) -> np.ndarray:
@@ -143,6 +201,7 @@ def represent(observation: Observation, model: ObjectModel, tray: Tray | None = 
     shares = expected_visibility(model).shares(T_world_item, eyes, tray or Tray.for_model(model), hiding=n)
     pose, scalars = T_world_item[:, :3].astype(np.float32), np.zeros((n + m, 7), np.float32)
     pose[n:, :, :3] = 0.0
+    axis = np.zeros(3) if model.symmetry.axis is None else model.symmetry.axis
     columns = objects.verification, objects.score, objects.spread, objects.support / t
     scalars[:n, :4] = np.column_stack(columns)[best]
     scalars[n:, 4] = 1.0
@@ -157,50 +216,42 @@ def represent(observation: Observation, model: ObjectModel, tray: Tray | None = 
         observation.positions.astype(np.float32),
         grid.astype(np.float32),
         observation.steps_left,
+        float(model.diameter),
+        np.asarray(axis, np.float32),
     )
 
 
 def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dict[str, torch.Tensor]:
-    """Padded tensors of B states on one grid.
+    """Padded tensors of B states of one object and one grid.
 
     Args:
         states: of any numbers of items and of views taken.
         views: (M,) those in question, all of the grid when None.
 
     Returns:
-        ``pose`` (B, n, 3, 4), ``scalars`` (B, n, 7), ``shown`` (B, n, M), ``seen`` (B, n, t) whose last column repeats
-        the current view, ``present`` (B, n), ``taken`` (B, t, 3) likewise, ``moves`` (B,) moves made, ``left`` (B,)
-        moves left, ``views`` (M, 3), ``pairs`` (B, M, n, 12) what is known of each object and each view: the share that
-        the view would show, how much that is above what was seen, how steeply the view looks down on the object, the
-        angle to the nearest view taken, its cosine, how much the views taken have seen from that side, how far away the
-        object is, whether the view is on the object's side of the bin, how far off the image's centre the object is,
-        and the direction to the view in the object's frame.
+        ``items`` (B, n, 18) and ``outlooks`` (B, M, 8) of the states; ``present`` (B, n), which items are no padding;
+        ``more`` (B,), whether moves are left after the next; ``pairs`` (B, M, n, 12) what is known of each item and
+        each view: the share that the view would show, how much that is above what was seen, how steeply the view
+        looks down on the item, the angle to the nearest view taken, its cosine, how much the views taken have seen from
+        that side, how far away the item is, whether the view is on the item's side of the bin, how far off the image's
+        centre the item is, and the direction to the view in the object's frame.
     """
     count = max(1, *(len(each.pose) for each in states))
-    longest = max(len(each.taken) for each in states)
     some = slice(None) if views is None else views
-    grid = np.ascontiguousarray(states[0].grid[some], np.float32)
+    grid, axis = np.ascontiguousarray(states[0].grid[some], np.float32), states[0].axis
     B, M = len(states), len(grid)
     arrays = {
-        "pose": np.zeros((B, count, 3, 4), np.float32),
-        "scalars": np.zeros((B, count, 7), np.float32),
-        "shown": np.zeros((B, count, M), np.float32),
-        "seen": np.zeros((B, count, longest), np.float32),
+        "items": np.zeros((B, count, ITEM_FEATURES), np.float32),
+        "outlooks": np.stack([each.outlooks[some] for each in states]),
         "present": np.zeros((B, count), bool),
-        "taken": np.zeros((B, longest, 3), np.float32),
+        "more": np.array([each.left > 1 for each in states]),
+        "pairs": np.zeros((B, M, count, PAIR_FEATURES), np.float32),
     }
     for row, each in enumerate(states):
-        n, t = each.seen.shape
-        arrays["pose"][row, :n], arrays["scalars"][row, :n] = each.pose, each.scalars
-        arrays["shown"][row, :n] = each.shown[:, some]
-        arrays["seen"][row, :n, :t], arrays["seen"][row, :n, t:] = each.seen, each.seen[:, -1:]
-        arrays["present"][row, :n] = True
-        arrays["taken"][row, :t], arrays["taken"][row, t:] = each.taken, each.taken[-1]
-    arrays["moves"] = np.array([len(each.taken) - 1 for each in states], np.float32)
-    arrays["left"] = np.array([each.left for each in states], np.float32)
-    arrays["views"] = grid
-    arrays["pairs"] = np.zeros((B, M, count, PAIR_FEATURES), np.float32)
-    _pair(*(arrays[name] for name in ("pose", "shown", "seen", "present", "taken", "views", "pairs")))
+        n = len(each.pose)
+        arrays["items"][row, :n], arrays["present"][row, :n] = each.items, True
+        shown = np.ascontiguousarray(each.shown[:, some])
+        _pair(each.pose, shown, each.seen, each.taken, grid, axis, arrays["pairs"][row])
     return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 
@@ -209,23 +260,21 @@ def _pair(
     pose: np.ndarray,
     shown: np.ndarray,
     seen: np.ndarray,
-    present: np.ndarray,
     taken: np.ndarray,
     views: np.ndarray,
+    symmetry: np.ndarray,
     pairs: np.ndarray,
 ) -> None:
-    """Fill ``pairs`` of :func:`gather` where objects are present; compiled, since it is a dozen numbers each."""
-    to_taken = np.empty(taken.shape[1:], np.float32)
-    for row, item in np.ndindex(present.shape):
-        if not present[row, item]:
-            continue
-        x0, y0, z0 = pose[row, item, 0, 3], pose[row, item, 1, 3], pose[row, item, 2, 3]
+    """Fill one state's ``pairs`` of :func:`gather`; compiled, since it is a dozen numbers each."""
+    to_taken, side, symmetric = np.empty(taken.shape, np.float32), np.empty(3, np.float32), symmetry.any()
+    radius = _length(taken[-1, 0], taken[-1, 1], taken[-1, 2])
+    for item in range(len(pose)):
+        x0, y0, z0 = pose[item, 0, 3], pose[item, 1, 3], pose[item, 2, 3]
         for index in range(len(to_taken)):
-            x, y, z = taken[row, index, 0] - x0, taken[row, index, 1] - y0, taken[row, index, 2] - z0
+            x, y, z = taken[index, 0] - x0, taken[index, 1] - y0, taken[index, 2] - z0
             length = _length(x, y, z)
             to_taken[index, 0], to_taken[index, 1], to_taken[index, 2] = x / length, y / length, z / length
-        radius = _length(taken[row, -1, 0], taken[row, -1, 1], taken[row, -1, 2])
-        from_axis, most = _length(x0, y0, np.float32(0)), seen[row, item].max()
+        from_axis, most = _length(x0, y0, np.float32(0)), seen[item].max()
         for view in range(len(views)):
             x, y, z = views[view, 0] - x0, views[view, 1] - y0, views[view, 2] - z0
             length = _length(x, y, z)
@@ -235,23 +284,23 @@ def _pair(
             for index in range(len(to_taken)):
                 cosine = x * to_taken[index, 0] + y * to_taken[index, 1] + z * to_taken[index, 2]
                 closest = max(closest, cosine)
-                known = max(known, seen[row, item, index] * (np.float32(1) + cosine))
+                known = max(known, seen[item, index] * (np.float32(1) + cosine))
             closest = min(closest, np.float32(1))
             off_axis = x * views[view, 0] + y * views[view, 1] + z * views[view, 2]
             off_axis /= _length(views[view, 0], views[view, 1], views[view, 2])
-            pairs[row, view, item, 0] = shown[row, item, view]
-            pairs[row, view, item, 1] = shown[row, item, view] - most
-            pairs[row, view, item, 2] = z
+            pair = pairs[view, item]
+            pair[0], pair[1], pair[2] = shown[item, view], shown[item, view] - most, z
             # Just off the ends, where the angle has no derivative.
-            pairs[row, view, item, 3] = np.arccos(closest * np.float32(0.999999)) / np.float32(np.pi)
-            pairs[row, view, item, 4] = closest
-            pairs[row, view, item, 5] = known / np.float32(2)
-            pairs[row, view, item, 6] = distance - np.float32(1)
-            pairs[row, view, item, 7] = (x0 * x + y0 * y) / from_axis
-            pairs[row, view, item, 8] = off_axis - np.float32(0.95)
+            pair[3] = np.arccos(closest * np.float32(0.999999)) / np.float32(np.pi)
+            pair[4], pair[5], pair[6] = closest, known / np.float32(2), distance - np.float32(1)
+            pair[7], pair[8] = (x0 * x + y0 * y) / from_axis, off_axis - np.float32(0.95)
             for axis in range(3):
-                along = x * pose[row, item, 0, axis] + y * pose[row, item, 1, axis] + z * pose[row, item, 2, axis]
-                pairs[row, view, item, 9 + axis] = along
+                side[axis] = x * pose[item, 0, axis] + y * pose[item, 1, axis] + z * pose[item, 2, axis]
+            if symmetric:
+                axial = side[0] * symmetry[0] + side[1] * symmetry[1] + side[2] * symmetry[2]
+                side[0], side[2] = axial, np.float32(0)
+                side[1] = np.sqrt(max(np.float32(1) - axial * axial, np.float32(0)))
+            pair[9], pair[10], pair[11] = side[0], side[1], side[2]
 
 
 @compiled

@@ -23,7 +23,15 @@ import torch
 from torch import nn
 
 from active6d_agent.policy import Decision, Observation, register_policy, weights_path
-from active6d_agent.scene_state import PAIR_FEATURES, SceneState, best_verified, gather, represent
+from active6d_agent.scene_state import (
+    ITEM_FEATURES,
+    PAIR_FEATURES,
+    VIEW_FEATURES,
+    SceneState,
+    best_verified,
+    gather,
+    represent,
+)
 from active6d_agent.weights_file import load_weights, save_weights
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel
@@ -32,8 +40,6 @@ from active6d_perception.visibility import Tray
 
 #: Gains are told as objects newly detected, and as the fall of the summed e_ADD over 50 mm.
 GAINS = 2
-_OBJECT_FEATURES = 18
-_VIEW_FEATURES = 8
 
 
 @dataclass(frozen=True)
@@ -80,28 +86,23 @@ class ViewAttention(nn.Module):
     """Values of all views.
 
     Args:
-        diameter: of the object, metres.
-        axis: (3,) unit axis of a continuous symmetry, None without one.
         hidden: width.
         weighing: what counted when it was validated.
     """
 
-    def __init__(
-        self, diameter: float, axis: Sequence[float] | None = None, hidden: int = 32, weighing: Weighing = Weighing()
-    ) -> None:
+    def __init__(self, hidden: int = 32, weighing: Weighing = Weighing()) -> None:
         super().__init__()
-        self.diameter, self.axis, self.hidden, self.weighing = diameter, axis, hidden, weighing
-        self.register_buffer("_axis", None if axis is None else torch.tensor(axis), persistent=False)
-        self.of_object = nn.Sequential(nn.Linear(_OBJECT_FEATURES, hidden), nn.ReLU())
+        self.hidden, self.weighing = hidden, weighing
+        self.of_object = nn.Sequential(nn.Linear(ITEM_FEATURES, hidden), nn.ReLU())
         self.in_context = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.ReLU())
         self.of_pair = nn.Linear(PAIR_FEATURES, hidden)
         self.pair_from_object = nn.Linear(hidden, hidden, bias=False)
-        self.pair_from_view = nn.Linear(_VIEW_FEATURES, hidden, bias=False)
+        self.pair_from_view = nn.Linear(VIEW_FEATURES, hidden, bias=False)
         self.mix = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU())
         self.attend = nn.Linear(hidden, 1)
         self.per_object = nn.Linear(hidden, 2 * GAINS)
         self.per_view = nn.Sequential(
-            nn.Linear(3 * hidden + _VIEW_FEATURES, hidden), nn.ReLU(), nn.Linear(hidden, 2 * GAINS)
+            nn.Linear(3 * hidden + VIEW_FEATURES, hidden), nn.ReLU(), nn.Linear(hidden, 2 * GAINS)
         )
 
     def forward(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -119,8 +120,7 @@ class ViewAttention(nn.Module):
         # those. What nobody has seen yet is for the view as a whole to say.
         bias = (seen.mask.sum(dim=1, keepdim=True) * self.per_object.bias)[:, None]
         gains = seen.total @ self.per_object.weight.T + bias + self.per_view(seen.whole)
-        more = (state["left"] > 1)[:, None, None]
-        return gains[..., :GAINS], gains[..., GAINS:] * more, seen.attention
+        return gains[..., :GAINS], gains[..., GAINS:] * state["more"][:, None, None], seen.attention
 
     def explain(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """What :meth:`forward` adds up, to learn from: twice (B, M, n + 1, 2), gains of going there next and of the
@@ -128,17 +128,17 @@ class ViewAttention(nn.Module):
         seen = self._look(state)
         own = self.per_object(seen.pairs) * seen.mask[:, None, :, None]
         gains = torch.cat([own, self.per_view(seen.whole)[:, :, None]], dim=2)
-        return gains[..., :GAINS], gains[..., GAINS:] * (state["left"] > 1)[:, None, None, None]
+        return gains[..., :GAINS], gains[..., GAINS:] * state["more"][:, None, None, None]
 
     def _look(self, state: dict[str, torch.Tensor]) -> "_Seen":
-        objects, pairs, views = self.describe(state)
-        h = self.of_object(objects)
+        views = state["outlooks"]
+        h = self.of_object(state["items"])
         mask = state["present"].to(h.dtype)
         count = mask.sum(dim=1, keepdim=True).clamp(min=1)
         pooled = (h * mask[..., None]).sum(dim=1) / count
         h = self.in_context(torch.cat([h, pooled[:, None].expand_as(h)], dim=-1))
         # Passes over (B, M, n, hidden) are what costs: sums are in place, and masks in the weights of sums.
-        e = self.of_pair(pairs)
+        e = self.of_pair(state["pairs"])
         e += self.pair_from_object(h)[:, None]
         e += self.pair_from_view(views)[:, :, None]
         e = e.relu_()
@@ -149,70 +149,10 @@ class ViewAttention(nn.Module):
         whole = torch.cat([attended, total / count[..., None], pooled[:, None].expand_as(total), views], dim=-1)
         return _Seen(e, total, whole, attention, mask)
 
-    def describe(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What is known of (B, n, 18) objects and patches, (B, M, n, 12) pairs and (B, M, 8) views; of the world's
-        directions only the vertical counts, but for what the square tray hides."""
-        taken, grid, pairs = state["taken"], state["views"], state["pairs"]
-        if self._axis is not None:
-            pairs = torch.cat([pairs[..., :-3], self._sides(pairs[..., -3:])], dim=-1)
-        outlook, headings = (each / torch.linalg.vector_norm(each, dim=-1, keepdim=True) for each in (grid, taken))
-        return self._describe_objects(state), pairs, self._describe_views(state, outlook, headings)
-
-    def _sides(self, directions: torch.Tensor) -> torch.Tensor:
-        """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
-        if self._axis is None:
-            return directions
-        axial = directions @ self._axis
-        return torch.stack([axial, (1 - axial**2).clamp(min=0.0).sqrt(), torch.zeros_like(axial)], dim=-1)
-
-    def _describe_objects(self, state: dict[str, torch.Tensor]) -> torch.Tensor:
-        pose, seen = state["pose"], state["seen"]
-        from_axis = torch.linalg.vector_norm(pose[..., :2, 3], dim=-1)
-        # The last view is repeated where others have more.
-        own = seen * (torch.arange(seen.shape[2]) <= state["moves"][:, None])[:, None]
-        apart = (pose[:, None, :, :, 3] - pose[:, :, None, :, 3]) / self.diameter
-        near = torch.exp(-(apart**2).sum(dim=-1)) * state["present"][:, None]
-        verification, score, spread, support, patch, surface_near, surface_around = state["scalars"].unbind(dim=-1)
-        columns = [
-            verification,
-            score,
-            (spread / self.diameter).clamp_(max=1.0),
-            support,
-            patch,
-            surface_near,
-            surface_around,
-            pose[..., 2, 3] / self.diameter,
-            from_axis / (2 * self.diameter),
-            near.sum(dim=-1) / 3,
-            (near * apart[..., 2].clamp(min=0.0)).sum(dim=-1),
-            seen.amax(dim=2),
-            seen[..., -1],
-            own.sum(dim=2) / 3,
-            (state["moves"] / 5).clamp_(max=2.0)[:, None].expand_as(score),
-            *self._sides(pose[..., 2, :3]).unbind(dim=-1),
-        ]
-        return torch.stack(columns, dim=-1)
-
-    def _describe_views(
-        self, state: dict[str, torch.Tensor], outlook: torch.Tensor, headings: torch.Tensor
-    ) -> torch.Tensor:
-        arcs = torch.acos((outlook @ headings.transpose(1, 2)).clamp_(-1, 1).mul_(0.999999)) / np.pi
-        moves, left = (torch.stack([state["moves"], state["left"]]) / 5).clamp_(max=2.0).unbind()
-        of_state = [headings[:, -1, 2], moves, left, state["present"].sum(dim=1) / 20.0, 1.0 / (1.0 + 5 * left)]
-        level, *rest = torch.stack(of_state)[:, :, None].expand(-1, *arcs.shape[:2]).unbind()
-        return torch.stack([outlook[:, 2].expand_as(level), level, arcs[..., -1], arcs.amin(dim=-1), *rest], dim=-1)
-
 
 def save_network(network: ViewAttention, path: Path, object_name: str, provenance: dict | None = None) -> None:
     """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
-    axis = None if network.axis is None else [float(value) for value in network.axis]
-    config = {
-        "object": object_name,
-        "diameter": float(network.diameter),
-        "axis": axis,
-        "hidden": network.hidden,
-        "weighing": asdict(network.weighing),
-    }
+    config = {"object": object_name, "hidden": network.hidden, "weighing": asdict(network.weighing)}
     save_weights(network, path, "view-attention", config, provenance)
 
 
@@ -226,15 +166,9 @@ def load_network(path: Path, object_name: str) -> ViewAttention:
     def build(config: dict) -> ViewAttention:
         if config["object"] != object_name:
             raise ValueError(f"these are weights for '{config['object']}', not for '{object_name}'")
-        return ViewAttention(config["diameter"], config["axis"], config["hidden"], Weighing(**config["weighing"]))
+        return ViewAttention(config["hidden"], Weighing(**config["weighing"]))
 
     return load_weights(path, "view-attention", build)
-
-
-def new_network(model: ObjectModel, hidden: int = 32) -> ViewAttention:
-    """An untrained network for an object."""
-    axis = model.symmetry.axis
-    return ViewAttention(float(model.diameter), None if axis is None else axis.tolist(), hidden)
 
 
 @dataclass(frozen=True, eq=False)

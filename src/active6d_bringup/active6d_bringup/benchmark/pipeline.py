@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from active6d_agent.policy import Observation, Policy, create_policy, weights_path
-from active6d_agent.view_attention import new_network, save_network
+from active6d_agent.view_attention import ViewAttention, save_network
 from active6d_bringup.benchmark.graph import PreparedViews, prepare_views
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
@@ -113,7 +113,7 @@ def _make_policy(name: str, model: ObjectModel) -> tuple[Policy, bool]:
         return create_policy(name, model), True
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "untrained.safetensors"
-        save_network(new_network(model), path, model.name)
+        save_network(ViewAttention(), path, model.name)
         return create_policy(name, model, weights=str(path)), False
 
 
