@@ -8,9 +8,9 @@ from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception import model_views, surface, verification, visibility
+from active6d_perception import fusion, model_views, surface, verification, visibility
 
-MODULES = (model_views, surface, verification, visibility)
+MODULES = (fusion, model_views, surface, verification, visibility)
 
 
 def versions():
@@ -27,7 +27,7 @@ def test_no_view_waits_for_the_compiler(render, pose):
     """Neither the first one nor one with read-only images."""
     model = load_object("mug")
     verifier, scene = verification.Verifier(model), surface.SceneSurface(model)
-    visible = visibility.ExpectedVisibility(model)
+    visible, fused = visibility.ExpectedVisibility(model), fusion.SceneFusion(model)
     compiled = versions()
     assert sum(compiled.values()) >= 8
     depth = render(model, pose(0))[0].copy()
@@ -39,6 +39,8 @@ def test_no_view_waits_for_the_compiler(render, pose):
         hypotheses = Hypotheses.from_masks(pose(0), np.ones(1), np.ones(1), mask, depth)
         assert verifier.score(depth, DEFAULT_CAMERA, hypotheses) > 0.9
         scene.add_view(1, depth, DEFAULT_CAMERA, T_world_camera)
+        fused.add_view(int(writable), T_world_camera, hypotheses, np.ones(1))
+        assert len(fused.objects(int(writable), T_world_camera, DEFAULT_CAMERA)) == 1
         T_world_object = T_world_camera @ pose(0)
         scene.unexplained(T_world_object)
         for tray in (None, visibility.Tray.for_model(model)):

@@ -14,6 +14,7 @@ from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert
 from active6d_perception.clustering import cluster, suppress_neighbours
+from active6d_perception.compiled import compiled
 from active6d_perception.model_views import ModelViews, model_views
 from active6d_perception.surface import EXPLAINED_WITHIN
 from active6d_perception.symmetric_distance import SymmetricDistance
@@ -82,6 +83,7 @@ def select(labels: np.ndarray, weight: np.ndarray | None, positions: np.ndarray,
     return best[suppress_neighbours(positions[best][None], np.ones((1, len(best)), bool), exclusion)[0]]
 
 
+@compiled
 def summarise(
     labels: np.ndarray, chosen: np.ndarray, stamps: np.ndarray, distance: np.ndarray, stamp: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,13 +100,18 @@ def summarise(
         (n,) number of views with a hypothesis in the cluster, (n,) largest distance within it, and (n,) its best
         hypothesis from the current view, -1 without one.
     """
-    same = labels[:, None] == labels
-    members = same[chosen]
-    views = np.unique(stamps, return_inverse=True)[1]
-    support = ((members @ np.eye(views.max(initial=0) + 1)[views]) > 0).sum(axis=1)
-    spread = (members * np.where(same, distance, 0.0).max(axis=1)).max(axis=1)
-    current = members & (stamps == stamp)
-    return support, spread, np.where(current.any(axis=1), current.argmax(axis=1), -1)
+    support, spread, current = np.zeros(len(chosen), np.int64), np.zeros(len(chosen)), np.full(len(chosen), -1)
+    for index in range(len(chosen)):
+        members = np.flatnonzero(labels == labels[chosen[index]])
+        for place in range(len(members)):
+            member, known = members[place], False
+            for earlier in members[:place]:
+                known |= stamps[earlier] == stamps[member]
+                spread[index] = max(spread[index], distance[earlier, member])
+            support[index] += not known
+            if stamps[member] == stamp and not known:
+                current[index] = member
+    return support, spread, current
 
 
 def confidence(verification: np.ndarray, score: np.ndarray) -> np.ndarray:
@@ -152,13 +159,14 @@ def project_features(
     """
     R, t = T_camera_object[:, :3, :3], T_camera_object[:, :3, 3]
     # Coordinates before points, so that each is one contiguous row: several times faster than the other way round.
-    x, y, z = np.moveaxis(
-        (R.reshape(-1, 3) @ views.outline.T).reshape(len(R), 3, len(views.outline)) + t[..., None], 1, 0
-    )
-    z = np.maximum(z, 1e-3)
-    u = (camera.fx * (x / z) + (camera.cx + 0.5)) / camera.width
-    v = (camera.fy * (y / z) + (camera.cy + 0.5)) / camera.height
-    box = np.stack([u.min(axis=1), v.min(axis=1), u.max(axis=1), v.max(axis=1)], axis=1).clip(0.0, 1.0)
+    points = (R.reshape(-1, 3) @ views.outline.T).reshape(len(R), 3, len(views.outline)) + t[..., None]
+    ratio = points[:, :2] / np.maximum(points[:, 2:], 1e-3)
+    # Pixels rise with the ratios, so that only the outermost need be computed.
+    least, most = ratio.min(axis=2), ratio.max(axis=2)
+    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx + 0.5, camera.cy + 0.5])
+    size = np.array([camera.width, camera.height])
+    box = ((focal * np.concatenate([least, most], axis=1).reshape(-1, 2, 2) + centre) / size).reshape(-1, 4)
+    box = np.minimum(np.maximum(box, 0.0), 1.0)
     centroid = views.centroids[views.nearest_direction(T_camera_object)]
     return box, np.einsum("nj,nj->n", R[:, 2], centroid) + t[:, 2]
 
@@ -175,6 +183,9 @@ class SceneFusion:
         self._distance = SymmetricDistance(model)
         self._views = model_views(model)
         self.reset()
+        # Now, so that no view waits for the compiler.
+        nothing = np.zeros(0, np.int64)
+        summarise(nothing, nothing, nothing, np.zeros((0, 0)), 0)
 
     def reset(self) -> None:
         """Forget all views."""

@@ -91,16 +91,8 @@ class Verifier:
         q, n_q = _into_object_frames(points, normals, np.ascontiguousarray(T_camera_object, float), owner)
         direction = self.views.nearest_direction(T_camera_object)[owner]
         distance, p = self.views.nearest_visible(q, direction, self.epsilon + self.views.spacing)
-        reached = np.flatnonzero(p >= 0)
-        q, p, distance = q.take(reached, axis=0), p[reached], distance[reached]
-        n_p = self.views.normals.take(p, axis=0)
-        off_plane = np.einsum("ni,ni->n", q - self.views.points.take(p, axis=0), n_p)
-        along = np.sqrt(np.maximum(distance**2 - off_plane**2, 0.0))
-        to_surface = np.hypot(off_plane, np.maximum(along - self.views.spacing, 0.0))
-        product = np.einsum("ni,ni->n", n_q.take(reached, axis=0), n_p)
-        fits = np.zeros(len(points))
-        fits[reached] = local_fit(to_surface, product, self.epsilon)
-        return fits
+        surface = self.views.points, self.views.normals, self.views.spacing
+        return local_fit(*_against_discs(q, n_q, distance, p, surface), self.epsilon)
 
     def mask_pixels(self, depth: np.ndarray, hypotheses: Hypotheses) -> tuple[np.ndarray, np.ndarray]:
         """Pixels with depth inside the masks, at most ``samples`` of each, evenly spaced in raster order.
@@ -227,3 +219,38 @@ def _into_object_frames(
             q[index, axis] = x * T[0, axis] + y * T[1, axis] + z * T[2, axis]
             n_q[index, axis] = normal[0] * T[0, axis] + normal[1] * T[1, axis] + normal[2] * T[2, axis]
     return q, n_q
+
+
+@compiled
+def _against_discs(
+    q: np.ndarray,
+    n_q: np.ndarray,
+    distance: np.ndarray,
+    p: np.ndarray,
+    surface: tuple[np.ndarray, np.ndarray, float],
+) -> tuple[np.ndarray, np.ndarray]:
+    """What equation 1 takes of points and the surface, of which every sample stands for a disc.
+
+    Args:
+        q: (n, 3) points in the object frame.
+        n_q: (n, 3) their normals.
+        distance: (n,) metres from the nearest samples.
+        p: (n,) the nearest samples, -1 where none is near.
+        surface: (s, 3) samples, (s, 3) their normals, and the radius of their discs in metres.
+
+    Returns:
+        (n,) distances to the surface in metres, infinite where no sample is near, and (n,) products of the normals.
+    """
+    points, normals, radius = surface
+    to_surface, product = np.full(len(q), np.inf), np.zeros(len(q))
+    for index in range(len(q)):
+        sample = p[index]
+        if sample < 0:
+            continue
+        off_plane = 0.0
+        for axis in range(3):
+            off_plane += (q[index, axis] - points[sample, axis]) * normals[sample, axis]
+            product[index] += n_q[index, axis] * normals[sample, axis]
+        along = np.sqrt(max(distance[index] ** 2 - off_plane**2, 0.0))
+        to_surface[index] = np.hypot(off_plane, max(along - radius, 0.0))
+    return to_surface, product
