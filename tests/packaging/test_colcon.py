@@ -104,7 +104,8 @@ def test_shared_files(install, folder):
 def test_every_file_is_installed(install, package):
     """Modules, object descriptions, meshes, scenes, weights, templates: all that lies in the package."""
     source = ROOT / "src" / package / package
-    files = {path.relative_to(source) for path in source.rglob("*") if path.is_file() and path.suffix != ".pyc"}
+    files = {path.relative_to(source) for path in source.rglob("*") if path.is_file()}
+    files = {path for path in files if "__pycache__" not in path.parts}
     site = next((install / package).glob("lib/python*/site-packages")) / package
     assert not sorted(str(path) for path in files if not (site / path).is_file())
 
