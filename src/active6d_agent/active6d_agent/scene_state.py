@@ -110,17 +110,14 @@ class SceneState:
         arcs = np.arccos((outlook @ heading.T).clip(-1.0, 1.0) * np.float32(0.999999)) / np.float32(np.pi)
         moves, left = self._few(len(self.taken) - 1), self._few(self.left)
         known = np.empty((len(outlook), VIEW_FEATURES), np.float32)
-        known[:, 0], known[:, 1], known[:, 2], known[:, 3] = (
-            outlook[:, 2],
-            heading[-1, 2],
-            arcs[:, -1],
-            arcs.min(axis=1),
-        )
+        known[:, 0], known[:, 1] = outlook[:, 2], heading[-1, 2]
+        known[:, 2], known[:, 3] = arcs[:, -1], arcs.min(axis=1)
         known[:, 4:] = moves, left, len(self.pose) / 20, 1 / (1 + 5 * left)
         return known
 
     @staticmethod
     def _few(moves: int) -> float:
+        """A number of moves in fives, of many only that there are many."""
         return min(moves / 5, 2.0)
 
     def _sides(self, directions: np.ndarray) -> np.ndarray:
