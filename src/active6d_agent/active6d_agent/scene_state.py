@@ -97,7 +97,7 @@ class SceneState:
             self.seen[:, -1],
             self.seen.sum(axis=1) / 3,
             moves,
-            *self._sides(upright).T,
+            *_sides(upright, self.axis).T,
         ]
         return np.stack(columns, axis=1).astype(np.float32)
 
@@ -119,13 +119,6 @@ class SceneState:
     def _few(moves: int) -> float:
         """A number of moves in fives, of many only that there are many."""
         return min(moves / 5, 2.0)
-
-    def _sides(self, directions: np.ndarray) -> np.ndarray:
-        """(n, 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
-        if not self.axis.any():
-            return directions
-        axial = directions @ self.axis
-        return np.stack([axial, np.sqrt(np.maximum(1 - axial**2, 0.0)), np.zeros_like(axial)], axis=-1)
 
 
 def best_verified(observation: Observation) -> np.ndarray:
@@ -235,7 +228,7 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
     """
     count = max(1, *(len(each.pose) for each in states))
     some = slice(None) if views is None else views
-    grid, axis = np.ascontiguousarray(states[0].grid[some], np.float32), states[0].axis
+    grid = np.ascontiguousarray(states[0].grid[some], np.float32)
     B, M = len(states), len(grid)
     arrays = {
         "items": np.zeros((B, count, ITEM_FEATURES), np.float32),
@@ -248,22 +241,25 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
         n = len(each.pose)
         arrays["items"][row, :n], arrays["present"][row, :n] = each.items, True
         shown = np.ascontiguousarray(each.shown[:, some])
-        _pair(each.pose, shown, each.seen, each.taken, grid, axis, arrays["pairs"][row])
+        _pair(each.pose, shown, each.seen, each.taken, grid, arrays["pairs"][row])
+    arrays["pairs"][..., -3:] = _sides(arrays["pairs"][..., -3:], states[0].axis)
     return {name: torch.from_numpy(values) for name, values in arrays.items()}
+
+
+def _sides(directions: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
+    if not axis.any():
+        return directions
+    axial = directions @ axis
+    return np.stack([axial, np.sqrt(np.maximum(1 - axial**2, 0.0)), np.zeros_like(axial)], axis=-1)
 
 
 @compiled
 def _pair(
-    pose: np.ndarray,
-    shown: np.ndarray,
-    seen: np.ndarray,
-    taken: np.ndarray,
-    views: np.ndarray,
-    symmetry: np.ndarray,
-    pairs: np.ndarray,
+    pose: np.ndarray, shown: np.ndarray, seen: np.ndarray, taken: np.ndarray, views: np.ndarray, pairs: np.ndarray
 ) -> None:
     """Fill one state's ``pairs`` of :func:`gather`; compiled, since it is a dozen numbers each."""
-    to_taken, side, symmetric = np.empty(taken.shape, np.float32), np.empty(3, np.float32), symmetry.any()
+    to_taken = np.empty(taken.shape, np.float32)
     radius = _length(taken[-1, 0], taken[-1, 1], taken[-1, 2])
     for item in range(len(pose)):
         x0, y0, z0 = pose[item, 0, 3], pose[item, 1, 3], pose[item, 2, 3]
@@ -292,12 +288,7 @@ def _pair(
             pair[4], pair[5], pair[6] = closest, known / np.float32(2), distance - np.float32(1)
             pair[7], pair[8] = (x0 * x + y0 * y) / from_axis, off_axis - np.float32(0.95)
             for axis in range(3):
-                side[axis] = x * pose[item, 0, axis] + y * pose[item, 1, axis] + z * pose[item, 2, axis]
-            if symmetric:
-                axial = side[0] * symmetry[0] + side[1] * symmetry[1] + side[2] * symmetry[2]
-                side[0], side[2] = axial, np.float32(0)
-                side[1] = np.sqrt(max(np.float32(1) - axial * axial, np.float32(0)))
-            pair[9], pair[10], pair[11] = side[0], side[1], side[2]
+                pair[9 + axis] = x * pose[item, 0, axis] + y * pose[item, 1, axis] + z * pose[item, 2, axis]
 
 
 @compiled
