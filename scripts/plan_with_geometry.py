@@ -6,6 +6,7 @@ Usage: scripts/plan_with_geometry.py OBJECT [--split SPLIT] [--sample EPISODES]
 """
 
 import argparse
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ def read_split(name: str, split: str) -> tuple[BankLookup, list[np.ndarray]]:
     stored = {f"{name}/{split}/{index}": index for index in range(SPLITS[split])}
     scenes = [scene for scene in bank.scenes if scene.name in stored]
     shown = [load_scene(name, split, stored[scene.name]).visible_fraction for scene in scenes]
-    return BankLookup(type(bank)(bank.object_name, bank.sphere, bank.grid, scenes, bank.provenance)), shown
+    return BankLookup(replace(bank, scenes=scenes)), shown
 
 
 def describe(lookup: BankLookup, scene: int, shown: np.ndarray) -> torch.Tensor:
