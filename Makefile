@@ -17,13 +17,13 @@ demo: setup  ## one episode on a heap of cups: a bag and a report in bags/demo
 	@echo "Open $(DEMO)/report.html in a browser; the bag beside it opens in Foxglove, ros2 bag and rosbags."
 
 results: setup  ## what docs/results.md shows and is not measured yet, except trainings
-	$(BIN)/python scripts/reproduce_results.py
+	$(BIN)/python -m active6d_tools.results.reproduce
 
 test: setup  ## all tests
 	$(BIN)/python -m pytest tests
 
 lint: setup  ## ruff on all Python files
-	$(BIN)/ruff check src tests scripts
+	$(BIN)/ruff check src tests
 
 clean:  ## remove .venv, builds and the demo
 	rm -rf .venv ros2_ws/{build,install,log} $(DEMO) src/*/*.egg-info src/*/build .pytest_cache .ruff_cache .hypothesis

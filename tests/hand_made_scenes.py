@@ -11,8 +11,8 @@ from active6d_core.camera import PinholeCamera
 from active6d_core.object_model import ObjectModel, Symmetry
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_sim import scene_store
-from active6d_sim.scene import Bin, Scene
+from active6d_sim.scenes import scene_store
+from active6d_sim.scenes.scene import Bin, Scene
 
 SPHERE = ViewSphere()
 #: A small picture with its principal point off the centre and pixels that are not square.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from active6d_bringup.bag import EpisodeRecord, RecordedStep
+from active6d_bringup.bags.reader import EpisodeRecord, RecordedStep
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.se3 import make_transform

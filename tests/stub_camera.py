@@ -8,7 +8,9 @@ from geometry_msgs.msg import PoseArray, PoseStamped
 from sensor_msgs.msg import CameraInfo, Image
 
 from active6d_core.camera import PinholeCamera, View
-from active6d_core.conversions import (
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.object_model import ObjectModel
+from active6d_core.ros.conversions import (
     MessageError,
     camera_to_info,
     color_to_image,
@@ -19,12 +21,10 @@ from active6d_core.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.hypotheses import Hypotheses
-from active6d_core.node import GraphNode, run_node
-from active6d_core.object_model import ObjectModel
+from active6d_core.ros.node import GraphNode, run_node
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimator import list_estimators, register_estimator
+from active6d_perception.estimators.registry import list_estimators, register_estimator
 
 CAMERA = PinholeCamera.from_field_of_view(64, 48, 60.0)
 

@@ -6,9 +6,9 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from scipy.spatial.transform import Rotation
 
-from active6d_core import conversions
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses, SceneObjects
+from active6d_core.ros import conversions
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
 
@@ -19,7 +19,7 @@ LATCHED = ("camera/", "ground_truth/", "episode/", "hypotheses", "objects")
 
 @dataclass(frozen=True, eq=False)
 class StubStep:
-    """What one view of the stub episode holds; see ``active6d_bringup.bag.RecordedStep``."""
+    """What one view of the stub episode holds; see ``active6d_bringup.bags.reader.RecordedStep``."""
 
     view: View
     hypotheses: Hypotheses

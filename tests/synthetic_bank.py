@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from active6d_agent.bank import BankScene, SceneBank, world_poses
-from active6d_agent.baselines import line_of_sight
+from active6d_agent.bank.scene_bank import BankScene, SceneBank, world_poses
+from active6d_agent.policies.baselines import line_of_sight
 from active6d_core.metrics import e_add
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.surface import SurfaceGrid, explainer
+from active6d_perception.scene.observed_surface import SurfaceGrid, explainer
 
 
 def synthetic_scene(object_name: str, seed: int, objects: int, sphere: ViewSphere, noise: int = 0) -> BankScene:

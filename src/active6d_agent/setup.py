@@ -10,7 +10,7 @@ setup(
     maintainer_email="active6d@example.org",
     license="Apache-2.0",
     packages=find_packages(),
-    package_data={package: ["weights/**/*", "banks/*.npz"]},
+    package_data={package: ["policies/weights/*", "bank/shipped/*.npz", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
@@ -19,14 +19,14 @@ setup(
     install_requires=[
         "active6d_core",
         "active6d_perception",
-        "gymnasium",
         "numpy",
         "pyyaml",
         "safetensors",
         "scipy",
-        "stable-baselines3",
         "torch",
     ],
+    # Only the Gymnasium environment and PPO need these; a robot does not.
+    extras_require={"training": ["gymnasium", "stable-baselines3"]},
     entry_points={
         "console_scripts": [
             "attention_policy = active6d_agent.nodes.attention_policy:main",

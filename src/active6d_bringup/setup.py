@@ -7,40 +7,23 @@ package = "active6d_bringup"
 setup(
     name=package,
     version="0.1.0",
-    description="Launch files, parameters, layouts, recorder, player and the active6d command",
+    description="Launch files, parameters, viewer layouts, episode recorder, bag player and replay",
     maintainer="active6d developers",
     maintainer_email="active6d@example.org",
     license="Apache-2.0",
     packages=find_packages(),
-    package_data={package: ["report/*.html", "report/*.j2", "report/*.css", "report/*.js"]},
+    package_data={package: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
         *((f"share/{package}/{folder}", glob(f"{folder}/*")) for folder in ("launch", "config", "rviz", "foxglove")),
     ],
     python_requires=">=3.11",
-    install_requires=[
-        "active6d_core",
-        "active6d_sim",
-        "active6d_perception",
-        "active6d_agent",
-        "jinja2",
-        "matplotlib",
-        "numpy",
-        "open3d-cpu",
-        "pillow",
-        "pyyaml",
-        "rich",
-        "rosbags",
-        "scipy",
-        "torch",
-        "typer",
-    ],
+    install_requires=["active6d_agent", "active6d_core", "active6d_perception", "numpy", "pyyaml", "rosbags"],
     entry_points={
         "console_scripts": [
             "episode_recorder = active6d_bringup.nodes.episode_recorder:main",
             "bag_player = active6d_bringup.nodes.bag_player:main",
-            "active6d = active6d_bringup.cli:main",
         ]
     },
 )

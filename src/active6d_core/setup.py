@@ -10,11 +10,16 @@ setup(
     maintainer_email="active6d@example.org",
     license="Apache-2.0",
     packages=find_packages(),
-    package_data={package: ["objects/**/*"]},
+    package_data={package: ["objects/**/*", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
     ],
     python_requires=">=3.11",
-    install_requires=["numpy", "pyyaml", "scipy", "trimesh"],
+    install_requires=[
+        "numpy",
+        "pyyaml",
+        "scipy",
+        "trimesh",
+    ],
 )

@@ -10,13 +10,21 @@ setup(
     maintainer_email="active6d@example.org",
     license="Apache-2.0",
     packages=find_packages(),
-    package_data={package: ["scenes/*/*.npz"]},
+    package_data={package: ["scenes/stored/*/*.npz", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
     ],
     python_requires=">=3.11",
-    install_requires=["active6d_core", "numpy", "open3d-cpu", "pillow", "pybullet", "scipy", "trimesh"],
+    install_requires=[
+        "active6d_core",
+        "numpy",
+        "open3d-cpu",
+        "pillow",
+        "pybullet",
+        "scipy",
+        "trimesh",
+    ],
     entry_points={
         "console_scripts": [
             "camera_simulator = active6d_sim.nodes.camera_simulator:main",

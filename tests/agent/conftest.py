@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from active6d_agent.policy import Observation
+from active6d_agent.policies.registry import Observation
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel, Symmetry
 from active6d_core.se3 import make_transform

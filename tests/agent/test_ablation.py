@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from synthetic_bank import synthetic_bank
 
-from active6d_agent import ablation
-from active6d_agent.environment import RewardParameters
-from active6d_agent.evaluation import all_starts, run_named
-from active6d_agent.lookup import BankLookup
-from active6d_agent.train import TrainingParameters
-from active6d_agent.view_attention import ViewAttention, save_network
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.gym_environment import RewardParameters
+from active6d_agent.evaluation import ablations as ablation
+from active6d_agent.evaluation.policy_evaluation import all_starts, run_named
+from active6d_agent.policies.attention.ppo import PpoParameters
+from active6d_agent.policies.view_attention.network import ViewAttention, save_network
 from active6d_core.metrics import evaluate_scene
-from active6d_perception.fusion import RANKINGS
+from active6d_perception.scene.fusion import RANKINGS
 
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BankLookup(synthetic_bank("mug", scenes=2, objects=6))
+    return BatchedFusion(synthetic_bank("mug", scenes=2, objects=6))
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_what_hypotheses_are_ranked_by_matters_where_the_scores_differ(lookup, s
 
 def test_variants_are_trained_once(lookup, starts, tmp_path):
     banks = dict.fromkeys(("train", "val", "test"), lookup)
-    parameters = TrainingParameters(steps=2, total=40, environments=4, rollout=4, batch=16, evaluate_every=20)
+    parameters = PpoParameters(steps=2, total=40, environments=4, rollout=4, batch=16, evaluate_every=20)
     variants = {
         "far": (parameters, RewardParameters(alpha=0.0)),
         "rule": (replace(parameters, attend="lowest-score"), RewardParameters()),

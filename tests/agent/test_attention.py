@@ -7,7 +7,9 @@ import pytest
 import torch
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.attention import (
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.gym_environment import Active6DEnv, Active6DVectorEnv, RewardParameters
+from active6d_agent.policies.attention.network import (
     AttentionNetwork,
     AttentionPolicy,
     ObjectAttention,
@@ -15,15 +17,13 @@ from active6d_agent.attention import (
     load_network,
     save_network,
 )
-from active6d_agent.environment import Active6DEnv, Active6DVectorEnv, RewardParameters
-from active6d_agent.lookup import BankLookup
-from active6d_agent.policy import Observation, create_policy
-from active6d_agent.train import BankVecEnv, PaperPolicy, TrainingParameters, train_policy, validate
+from active6d_agent.policies.attention.ppo import BankVecEnv, PaperPolicy, PpoParameters, train_ppo, validate
+from active6d_agent.policies.registry import Observation, create_policy
 
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BankLookup(synthetic_bank("mug"))
+    return BatchedFusion(synthetic_bank("mug"))
 
 
 @pytest.fixture
@@ -209,13 +209,13 @@ def test_training_is_its_seed_learns_and_resumes(lookup, tmp_path):
     settings = {"environments": 8, "rollout": 5, "batch": 20, "evaluate_every": 40, "seed": 3}
     curves = []
     for name in ("a", "b"):
-        parameters = TrainingParameters(total=80, **settings)
-        curves.append(list(train_policy(lookup, lookup, tmp_path / name, parameters)))
+        parameters = PpoParameters(total=80, **settings)
+        curves.append(list(train_ppo(lookup, lookup, tmp_path / name, parameters)))
     assert [(p.steps, p.detection_rate, p.e_add_mm, p.mean_return) for p in curves[0]] == [
         (p.steps, p.detection_rate, p.e_add_mm, p.mean_return) for p in curves[1]
     ]
-    longer = TrainingParameters(total=120, **settings)
-    later = list(train_policy(lookup, lookup, tmp_path / "a", longer, resume=True))
+    longer = PpoParameters(total=120, **settings)
+    later = list(train_ppo(lookup, lookup, tmp_path / "a", longer, resume=True))
     assert [p.steps for p in later] == [120]
     assert len((tmp_path / "a" / "curve.jsonl").read_text().splitlines()) == 3
     best = max(
@@ -224,18 +224,18 @@ def test_training_is_its_seed_learns_and_resumes(lookup, tmp_path):
     network = load_network(tmp_path / "a" / "best.safetensors")
     assert validate(network, lookup, 5)[0] == pytest.approx(best["detection_rate"])
     with pytest.raises(ValueError, match="other parameters"):
-        list(train_policy(lookup, lookup, tmp_path / "a", TrainingParameters(total=9, gamma=0.5), resume=True))
+        list(train_ppo(lookup, lookup, tmp_path / "a", PpoParameters(total=9, gamma=0.5), resume=True))
     with pytest.raises(ValueError, match="nothing to resume from"):
-        list(train_policy(lookup, lookup, tmp_path / "c", longer, resume=True))
+        list(train_ppo(lookup, lookup, tmp_path / "c", longer, resume=True))
 
 
 def test_training_learns_what_is_rewarded(lookup, tmp_path):
     """With a penalty on motion alone, the policy must come to stay near."""
     reward = RewardParameters(alpha=0.0, beta=0.0, error_scale=0.0, motion_scale=1.0)
-    parameters = TrainingParameters(
+    parameters = PpoParameters(
         total=12_800, environments=64, rollout=10, evaluate_every=1_280, learning_rate=3e-3, batch=128
     )
-    curve = list(train_policy(lookup, lookup, tmp_path, parameters, reward))
+    curve = list(train_ppo(lookup, lookup, tmp_path, parameters, reward))
     assert curve[-1].mean_return > 0.7 * curve[0].mean_return, "the returns are negative"
     assert curve[-1].distance_m < 0.7 * curve[0].distance_m
 

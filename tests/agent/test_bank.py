@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from synthetic_bank import observe_synthetic, synthetic_bank, synthetic_scene
 
-from active6d_agent.bank import BankScene, build_bank, load_bank, observe_scene, view_entropy
+from active6d_agent.bank.scene_bank import BankScene, build_bank, load_bank, observe_scene, view_entropy
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.surface import SurfaceGrid
+from active6d_perception.scene.observed_surface import SurfaceGrid
 
 SPHERE = ViewSphere()
 GRID = SurfaceGrid.for_model(load_object("mug"))

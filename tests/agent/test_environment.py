@@ -8,21 +8,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.environment import ENVIRONMENT_ID, MAX_OBJECTS, Active6DEnv, Active6DVectorEnv, RewardParameters
-from active6d_agent.lookup import BankLookup
-from active6d_agent.throughput import measure_steps_per_second
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.gym_environment import (
+    ENVIRONMENT_ID,
+    MAX_OBJECTS,
+    Active6DEnv,
+    Active6DVectorEnv,
+    RewardParameters,
+)
+from active6d_agent.environment.throughput import measure_steps_per_second
 from active6d_core.camera import DEFAULT_CAMERA
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import e_add, evaluate_scene
 from active6d_core.se3 import transform_from_quaternion
-from active6d_perception.fusion import FusionParameters, SceneFusion
+from active6d_perception.scene.fusion import FusionParameters, SceneFusion
 
 EPISODE = [12, 57, 3, 80, 44, 99]
 
 
 @pytest.fixture(scope="module", params=["mug", "coffee_cup"])
 def lookup(request):
-    return BankLookup(synthetic_bank(request.param))
+    return BatchedFusion(synthetic_bank(request.param))
 
 
 def fuse_as_the_node_does(lookup, scene, views, parameters=None):
@@ -48,7 +54,7 @@ def test_fusion_is_the_nodes(lookup, scene, views):
 
 def test_fusion_parameters_are_honoured():
     parameters = FusionParameters(cut=0.1, exclusion=0.4, min_verification=0.5)
-    lookup = BankLookup(synthetic_bank("mug", scenes=1), parameters)
+    lookup = BatchedFusion(synthetic_bank("mug", scenes=1), parameters)
     expected, actual = fuse_as_the_node_does(lookup, 0, EPISODE, parameters), lookup.objects(0, EPISODE)
     np.testing.assert_allclose(actual.T_world_object, expected.T_world_object, atol=1e-9)
 

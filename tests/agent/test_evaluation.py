@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from synthetic_bank import synthetic_bank
 
-from active6d_agent import evaluation, oracle
-from active6d_agent.environment import Active6DEnv
-from active6d_agent.lookup import BankLookup
-from active6d_agent.policy import Decision, create_policy
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.gym_environment import Active6DEnv
+from active6d_agent.evaluation import oracle
+from active6d_agent.evaluation import policy_evaluation as evaluation
+from active6d_agent.policies.registry import Decision, create_policy
 from active6d_core.metrics import evaluate_scene
 
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BankLookup(synthetic_bank("mug"))
+    return BatchedFusion(synthetic_bank("mug"))
 
 
 @pytest.fixture(scope="module")

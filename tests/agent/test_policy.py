@@ -5,9 +5,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from active6d_agent import baselines
-from active6d_agent import policy as policy_module
-from active6d_agent.policy import (
+from active6d_agent.policies import baselines
+from active6d_agent.policies import registry as policy_module
+from active6d_agent.policies.registry import (
     choose_policy,
     create_policy,
     list_policies,

@@ -6,10 +6,12 @@ from hand_made_scenes import three_mugs
 from sensor_msgs.msg import PointCloud2
 from synthetic_bank import synthetic_bank
 
-from active6d_agent import evaluation
-from active6d_agent.bank import SceneBank, load_bank, observe_scene
-from active6d_agent.lookup import BankLookup
-from active6d_core.conversions import (
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.scene_bank import SceneBank, load_bank, observe_scene
+from active6d_agent.evaluation import policy_evaluation as evaluation
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.object_model import load_object
+from active6d_core.ros.conversions import (
     camera_to_info,
     depth_to_image,
     hypotheses_to_cloud,
@@ -17,14 +19,12 @@ from active6d_core.conversions import (
     segmentation_to_image,
     transform_to_pose_stamped,
 )
-from active6d_core.hypotheses import Hypotheses
-from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.nodes.hypothesis_fusion import HypothesisFusionNode
-from active6d_perception.surface import Explainer, SurfaceGrid
-from active6d_perception.verification import Verifier
-from active6d_sim.simulator import Simulator
+from active6d_perception.scene.observed_surface import Explainer, SurfaceGrid
+from active6d_perception.scene.verification import Verifier
+from active6d_sim.rendering.simulator import Simulator
 
 SPHERE = ViewSphere(0.8, (20.0, 60.0), 3)
 FRAME = "camera_optical_frame"
@@ -59,7 +59,7 @@ def lookup(simulator, tmp_path_factory):
     seen = observe_scene(scene.name, scene.T_world_object, simulator.capture, estimator, verifier, model, SPHERE, grid)
     path = tmp_path_factory.mktemp("bank") / "bank.npz"
     SceneBank("mug", SPHERE, grid, [seen], {}).save(path)
-    return BankLookup(load_bank(path))
+    return BatchedFusion(load_bank(path))
 
 
 def unexplained(lookup, views):
@@ -104,7 +104,7 @@ def test_the_node_publishes_what_the_bank_says(graph, tmp_path, monkeypatch, loo
 
 def test_observations_hold_what_each_episode_has_seen():
     """Side by side, with episodes of different lengths, as cell by cell."""
-    lookup = BankLookup(synthetic_bank("coffee_cup", scenes=2, objects=6))
+    lookup = BatchedFusion(synthetic_bank("coffee_cup", scenes=2, objects=6))
     rng = np.random.default_rng(0)
     scene = np.array([0, 1, 1, 0, 1])
     views = np.stack([rng.choice(100, 4, replace=False) for _ in scene])

@@ -11,13 +11,20 @@ import torch
 from scipy.spatial.transform import Rotation
 from synthetic_bank import synthetic_bank
 
-from active6d_agent import imitation, scene_state
-from active6d_agent.evaluation import all_starts, observe, run_named, run_policy
-from active6d_agent.lookup import BankLookup
-from active6d_agent.oracle import search_views, tally, worth
-from active6d_agent.policy import create_policy
-from active6d_agent.scene_state import best_verified, gather, gather_patches, guess_middle, represent
-from active6d_agent.view_attention import (
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.evaluation.oracle import search_views, tally, worth
+from active6d_agent.evaluation.policy_evaluation import all_starts, observe, run_named, run_policy
+from active6d_agent.policies.registry import create_policy
+from active6d_agent.policies.view_attention import dagger as dagger
+from active6d_agent.policies.view_attention import features as scene_state
+from active6d_agent.policies.view_attention.features import (
+    best_verified,
+    gather,
+    gather_patches,
+    guess_middle,
+    represent,
+)
+from active6d_agent.policies.view_attention.network import (
     ViewAttention,
     ViewAttentionPolicy,
     Weighing,
@@ -27,12 +34,12 @@ from active6d_agent.view_attention import (
 )
 from active6d_core.object_model import load_object
 from active6d_core.se3 import make_transform
-from active6d_perception.visibility import Tray, expected_visibility
+from active6d_perception.scene.expected_visibility import Tray, expected_visibility
 
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BankLookup(synthetic_bank("mug", scenes=2, objects=8))
+    return BatchedFusion(synthetic_bank("mug", scenes=2, objects=8))
 
 
 @pytest.fixture(scope="module")
@@ -311,7 +318,7 @@ def test_high_walls_raise_the_camera(policy, observation, monkeypatch):
         seen.append(states[0].shown)
         return value_views(network, observations, states, weighing)
 
-    monkeypatch.setattr("active6d_agent.view_attention.value_views", watched)
+    monkeypatch.setattr("active6d_agent.policies.view_attention.network.value_views", watched)
     for height in (0.0, 0.5):
         policy(wall_height=height, bin_width=0.5).decide(observation)
     open_table, well = seen
@@ -341,19 +348,19 @@ NO_PATCH = np.zeros((0, 3))
 
 def test_labels_are_what_views_gain(lookup):
     """Against whole episodes, view by view; the oracle takes the best of them."""
-    now, later = imitation.candidate_gains(lookup, 1, np.array([8, 30]), 3, NO_PATCH)
+    now, later = dagger.candidate_gains(lookup, 1, np.array([8, 30]), 3, NO_PATCH)
     assert np.isnan(now[[8, 30]]).all()
     assert np.isnan(later[[8, 30]]).all()
     scene = np.array([1])
     for view in (0, 31, 99):
         path = np.array([[8, 30, view]])
-        whole = imitation.spread(lookup.sphere, path, 2)
+        whole = dagger.spread(lookup.sphere, path, 2)
         added = tally(lookup, scene, path) - tally(lookup, scene, path[:, :2])
         np.testing.assert_allclose(now[view].sum(axis=0), added[0], atol=1e-6)
         added = tally(lookup, scene, whole) - tally(lookup, scene, path)
         np.testing.assert_allclose(later[view].sum(axis=0), added[0], atol=1e-6)
     worths = [worth(lookup, scene, np.array([[8, view]]))[0] if view != 8 else -1 for view in range(100)]
-    first, last = (gains.sum(axis=1) for gains in imitation.candidate_gains(lookup, 1, np.array([8]), 1, NO_PATCH))
+    first, last = (gains.sum(axis=1) for gains in dagger.candidate_gains(lookup, 1, np.array([8]), 1, NO_PATCH))
     assert int(np.argmax(worths)) == int(np.nanargmax(np.round(first @ [1.0, 0.999 / 8], 9)))
     assert int(np.argmax(worths)) == search_views(lookup, 1, 8, 1)[1]
     assert np.nanmax(np.abs(last)) == 0.0
@@ -363,7 +370,7 @@ def test_spread_views_are_the_farthest_of_their_ring(lookup):
     sphere = lookup.sphere
     elevation = np.degrees(np.arcsin(sphere.positions[:, 2] / sphere.radius))
     ring = np.flatnonzero(np.abs(elevation - 60) < 1)
-    (path,) = imitation.spread(sphere, np.array([[3, 70]]), 4)
+    (path,) = dagger.spread(sphere, np.array([[3, 70]]), 4)
     for count in range(2, 6):
         nearest = [min(sphere.arc(sphere.positions[view], sphere.positions[v]) for v in path[:count]) for view in ring]
         assert path[count] in ring
@@ -378,7 +385,7 @@ def test_labels_tell_which_object_gains(lookup):
         lookup.object_errors(lookup.fuse(np.array([1]), np.array([views]), np.array([views[-1]])))
         for views in (taken, [*taken, view])
     )
-    gains = imitation.candidate_gains(lookup, 1, np.array(taken), 2, NO_PATCH)[0][view]
+    gains = dagger.candidate_gains(lookup, 1, np.array(taken), 2, NO_PATCH)[0][view]
     observation = observe(lookup, np.array([1]), np.array([taken]), np.array([2]))[0]
     order, stand_ins = best_verified(observation).tolist(), {}
     for index, position in enumerate(observation.objects.T_world_object[:, :3, 3]):
@@ -398,12 +405,12 @@ def test_labels_tell_which_object_gains(lookup):
 def test_a_patch_stands_for_the_nearest_object_without_a_hypothesis(lookup):
     """Its gain moves from what nobody stands for to the patch; nothing else changes."""
     taken, true = np.array([8]), lookup.bank.scenes[1].T_world_object[:, :3, 3]
-    plain = imitation.candidate_gains(lookup, 1, taken, 3, NO_PATCH)[0]
+    plain = dagger.candidate_gains(lookup, 1, taken, 3, NO_PATCH)[0]
     stood_for = lookup.nearest_object[lookup.fuse(np.array([1]), taken[None], taken).objects[0]]
     missed = np.setdiff1d(np.arange(len(true)), stood_for)
     assert len(missed) > 0
     far, near = true[stood_for[0]] + [0.0, 0.0, 5.0], true[missed[0]] + [0.0, 0.0, 0.01]
-    told = imitation.candidate_gains(lookup, 1, taken, 3, np.stack([far, near]))[0]
+    told = dagger.candidate_gains(lookup, 1, taken, 3, np.stack([far, near]))[0]
     np.testing.assert_array_equal(told[:, : plain.shape[1] - 1], plain[:, :-1])
     far, near, rest = np.moveaxis(told[:, -3:], 1, 0)
     assert not np.nan_to_num(far).any()
@@ -459,7 +466,7 @@ def test_explained_gains_are_those_of_the_views(network, observation):
 def test_states_in_which_little_is_left_count_more():
     """Twice the spread of gains is a quarter of the weight, above a floor."""
     gains = np.random.default_rng(0).normal(size=(2, 1000, 1, 2)).astype(np.float32) * [[[[10.0]]], [[[20.0]]]]
-    weight = imitation._weigh_states(gains).numpy()
+    weight = dagger._weigh_states(gains).numpy()
     assert weight.sum() == pytest.approx(2.0, rel=1e-5)
     assert weight[0] / weight[1] == pytest.approx(gains[1, ..., 0].var() / gains[0, ..., 0].var(), rel=0.01)
 
@@ -467,18 +474,18 @@ def test_states_in_which_little_is_left_count_more():
 def test_training_and_deployment_move_alike(lookup, network, policy):
     starts = all_starts(lookup, 10, 0)
     deployed = run_policy(lookup, lambda scene: policy(), starts, 4)
-    measured = imitation.validate(network, lookup, starts, 4)
+    measured = dagger.validate(network, lookup, starts, 4)
     assert measured[0] == pytest.approx(deployed.detection_rate.mean())
     assert measured[2] == pytest.approx(deployed.distance_m.mean())
 
 
 def test_it_learns_its_way_past_random_and_resumes(tmp_path):
-    lookup = BankLookup(synthetic_bank("mug", scenes=3, objects=12))
+    lookup = BatchedFusion(synthetic_bank("mug", scenes=3, objects=12))
     starts = all_starts(lookup, 100, 0)
     random = run_named(lookup, "random", starts, 4)
     settings = {"episodes": 10, "updates": 60, "longest": 4, "steps": 4, "starts": 100, "batch": 48}
-    parameters = imitation.ImitationParameters(rounds=4, evaluate_every=2, **settings)
-    curve = list(imitation.imitate(lookup, lookup, tmp_path, parameters, Weighing(metres_weight=0.05)))
+    parameters = dagger.DaggerParameters(rounds=4, evaluate_every=2, **settings)
+    curve = list(dagger.train_dagger(lookup, lookup, tmp_path, parameters, Weighing(metres_weight=0.05)))
     assert [progress.round for progress in curve] == [2, 4]
     best = max(progress.detection_rate for progress in curve)
     assert best > random.detection_rate.mean() + 0.03
@@ -489,22 +496,22 @@ def test_it_learns_its_way_past_random_and_resumes(tmp_path):
     assert deployed.detection_rate.mean() > random.detection_rate.mean() + 0.03
     assert deployed.e_add_mm.mean() < random.e_add_mm.mean()
     assert deployed.distance_m.mean() <= random.distance_m.mean()
-    more = imitation.ImitationParameters(rounds=5, evaluate_every=2, **settings)
-    assert [p.round for p in imitation.imitate(lookup, lookup, tmp_path, more, resume=True)] == [5]
+    more = dagger.DaggerParameters(rounds=5, evaluate_every=2, **settings)
+    assert [p.round for p in dagger.train_dagger(lookup, lookup, tmp_path, more, resume=True)] == [5]
     assert len((tmp_path / "curve.jsonl").read_text().splitlines()) == 3
     with pytest.raises(ValueError, match="no weights of the view-attention policy"):
-        next(imitation.imitate(lookup, lookup, tmp_path / "none", more, resume=True))
+        next(dagger.train_dagger(lookup, lookup, tmp_path / "none", more, resume=True))
 
 
 def test_the_weighing_is_the_best_that_is_not_longer_than_random(lookup, network):
     starts = all_starts(lookup, 30, 0)
     given = network.weighing
-    chosen = imitation.choose_weighing(network, lookup, starts, 4)
+    chosen = dagger.choose_weighing(network, lookup, starts, 4)
     assert network.weighing == given
     most = run_named(lookup, "random", starts, 4).distance_m.mean()
 
     def rate(**changes):
-        measured = imitation.validate(replace_weighing(network, replace(chosen, **changes)), lookup, starts, 4)
+        measured = dagger.validate(replace_weighing(network, replace(chosen, **changes)), lookup, starts, 4)
         return measured[0] if measured[2] <= most else -1.0
 
     assert rate() == max(rate(metres_weight=each) for each in (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)) > 0
@@ -570,4 +577,4 @@ def test_parameters_out_of_range_are_named(policy, parameters, message):
     with pytest.raises(ValueError, match=message):
         policy(**parameters)
     with pytest.raises(ValueError, match="rounds"):
-        imitation.ImitationParameters(rounds=0)
+        dagger.DaggerParameters(rounds=0)

@@ -8,11 +8,11 @@ import pytest
 import yaml
 from ros_harness import fresh_domain
 
-from active6d_bringup.bag import read_episode
-from active6d_bringup.composition import NODES, GraphDescription
-from active6d_bringup.episode import EpisodeError, EpisodeInterrupted, EpisodeSettings, describe, run_episode
-from active6d_bringup.recording import CONTRACT, RecordingError
-from active6d_bringup.replay import ReplaySettings, replay
+from active6d_bringup.bags.reader import read_episode
+from active6d_bringup.bags.replay import ReplaySettings, replay
+from active6d_bringup.bags.writer import CONTRACT, RecordingError
+from active6d_bringup.graph.composition import NODES, GraphDescription
+from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, EpisodeSettings, describe, run_episode
 
 
 @pytest.fixture(autouse=True)

@@ -10,27 +10,27 @@ from ros_harness import fresh_domain
 from rosbags.rosbag2 import Reader
 from scipy.spatial.transform import Rotation
 
-from active6d_agent.policy import Observation, create_policy
-from active6d_bringup.bag import read_episode
-from active6d_bringup.episode import EpisodeSettings, run_episode
-from active6d_bringup.recording import CONTRACT, TYPESTORE, Per
-from active6d_bringup.replay import ReplaySettings, replay
-from active6d_core.conversions import (
+from active6d_agent.policies.registry import Observation, create_policy
+from active6d_bringup.bags.reader import read_episode
+from active6d_bringup.bags.replay import ReplaySettings, replay
+from active6d_bringup.bags.writer import CONTRACT, TYPESTORE, Per
+from active6d_bringup.graph.episode import EpisodeSettings, run_episode
+from active6d_core.object_model import load_object
+from active6d_core.ros.conversions import (
     hypotheses_from_cloud,
     hypotheses_to_cloud,
     objects_from_cloud,
     objects_to_cloud,
 )
-from active6d_core.object_model import load_object
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimator import create_estimator
-from active6d_perception.fusion import SceneFusion
-from active6d_perception.surface import SceneSurface
-from active6d_perception.verification import Verifier
-from active6d_sim.scene import Bin, Scene
-from active6d_sim.sensor import SensorNoise
-from active6d_sim.simulator import Simulator
+from active6d_perception.estimators.registry import create_estimator
+from active6d_perception.scene.fusion import SceneFusion
+from active6d_perception.scene.observed_surface import ObservedSurface
+from active6d_perception.scene.verification import Verifier
+from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.simulator import Simulator
+from active6d_sim.scenes.scene import Bin, Scene
 
 MOVES = 2
 SPHERE = ViewSphere()
@@ -129,7 +129,7 @@ def test_images_are_the_simulators(record, scene, settings):
 def test_perception_and_policy_are_the_core_functions(record):
     model = load_object("mug")
     estimator, verifier, fusion = create_estimator("geometric", model), Verifier(model), SceneFusion(model)
-    surface = SceneSurface(model)
+    surface = ObservedSurface(model)
     policy = create_policy("auto", model)
     policy.reset(np.random.default_rng([3, record.steps[0].stamp]))
     found_any = 0

@@ -11,11 +11,11 @@ import psutil
 import pytest
 from ros_harness import fresh_domain
 
-from active6d_bringup import processes as processes_module
-from active6d_bringup.bag import read_episode
-from active6d_bringup.composition import NODES, GraphDescription, running
-from active6d_bringup.episode import EpisodeInterrupted, EpisodeSettings, run_episode
-from active6d_bringup.processes import ProcessError, ProcessGraph
+from active6d_bringup.bags.reader import read_episode
+from active6d_bringup.graph import processes as processes_module
+from active6d_bringup.graph.composition import NODES, GraphDescription, running
+from active6d_bringup.graph.episode import EpisodeInterrupted, EpisodeSettings, run_episode
+from active6d_bringup.graph.processes import ProcessError, ProcessGraph
 
 
 @pytest.fixture
@@ -100,8 +100,8 @@ def test_interrupt_closes_the_bag_and_ends_every_process(graphs, tmp_path):
 
 def test_nodes_die_with_a_killed_supervisor(graphs):
     script = (
-        "import sys, time; from active6d_bringup.composition import NODES, GraphDescription;"
-        "from active6d_bringup.processes import ProcessGraph;"
+        "import sys, time; from active6d_bringup.graph.composition import NODES, GraphDescription;"
+        "from active6d_bringup.graph.processes import ProcessGraph;"
         "graph = ProcessGraph(GraphDescription({'attention_policy': {}}, domain=77));"
         "graph.start(); print(*[process.pid for process in graph.processes.values()], flush=True); time.sleep(60)"
     )

@@ -18,9 +18,9 @@ from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
 from stub_episode import StubEpisode, is_latched
 
+from active6d_bringup.bags.writer import CONTRACT, RecordingError, clear_padding, stamp_of
 from active6d_bringup.nodes.episode_recorder import EpisodeRecorderNode
-from active6d_bringup.recording import CONTRACT, RecordingError, clear_padding, stamp_of
-from active6d_core.node import GraphNode
+from active6d_core.ros.node import GraphNode
 
 TYPES = {topic.name: topic.type for topic in CONTRACT}
 

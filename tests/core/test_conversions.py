@@ -13,10 +13,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image, PointCloud2
 
-from active6d_core import conversions
 from active6d_core.camera import PinholeCamera
-from active6d_core.conversions import MessageError
 from active6d_core.hypotheses import Hypotheses, SceneObjects
+from active6d_core.ros import conversions
+from active6d_core.ros.conversions import MessageError
 from active6d_core.se3 import make_transform
 
 FRAME = "camera_optical_frame"

@@ -14,10 +14,11 @@ MAY_IMPORT = {
     "sim": {"core"},
     "perception": {"core"},
     "agent": {"core", "perception"},
-    "bringup": {"core", "sim", "perception", "agent"},
+    "bringup": {"core", "perception", "agent"},
+    "tools": {"core", "sim", "perception", "agent", "bringup"},
 }
-#: Layers two and three, which are made of messages and nodes; bringup's own ROS modules beside its command line.
-ROS_MODULES = {"conversions", "node", "optional_outputs"}
+#: Folders of the conversion and node layers.
+ROS_FOLDERS = {"ros", "nodes"}
 IMPORT_WITHOUT_ROS = """
 import importlib, sys
 
@@ -47,7 +48,7 @@ def core_modules(package):
     root = package_folder(package)
     for path in sorted(root.rglob("*.py")):
         parts = path.relative_to(root).with_suffix("").parts
-        if parts[0] != "nodes" and parts[-1] not in ROS_MODULES:
+        if parts[0] not in ROS_FOLDERS:
             yield ".".join([root.name, *(part for part in parts if part != "__init__")])
 
 
@@ -77,7 +78,7 @@ def test_packages_import_only_what_they_may(package):
         assert ours <= allowed, f"{path} imports {sorted(ours - allowed)}"
 
 
-@pytest.mark.parametrize("package", ["core", "perception", "agent"])
+@pytest.mark.parametrize("package", ["core", "perception", "agent", "bringup"])
 def test_a_robot_needs_no_physics(package):
     for path in package_folder(package).rglob("*.py"):
         assert not any(name.partition(".")[0] == "pybullet" for name in imports_of(path)), f"{path} imports pybullet"

@@ -17,8 +17,8 @@ from ros_harness import fresh_domain, reliable
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from active6d_core.conversions import MessageError, depth_to_image, image_to_depth, stamp_to_ns
-from active6d_core.node import GraphNode, StampSynchronizer
+from active6d_core.ros.conversions import MessageError, depth_to_image, image_to_depth, stamp_to_ns
+from active6d_core.ros.node import GraphNode, StampSynchronizer
 
 
 class DepthNode(GraphNode):
@@ -152,7 +152,7 @@ RUN_A_NODE = """
 import sys
 import threading
 import rclpy
-from active6d_core import node
+from active6d_core.ros import node
 from test_node import DepthNode
 
 class Defective(DepthNode):

@@ -8,8 +8,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from active6d_core.hypotheses import SceneObjects
-from active6d_core.node import GraphNode
-from active6d_core.optional_outputs import DetectionOutput, TransformOutput, detections_message, transforms_message
+from active6d_core.ros.node import GraphNode
+from active6d_core.ros.optional_outputs import DetectionOutput, TransformOutput, detections_message, transforms_message
 from active6d_core.se3 import make_transform, transform_from_quaternion, transform_points
 
 # The fields of vision_msgs 4, the version of ROS 2 Jazzy.

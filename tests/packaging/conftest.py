@@ -4,7 +4,7 @@ import pytest
 from rclpy.context import Context
 from ros_harness import fresh_domain
 
-from active6d_bringup.composition import NODES, load_node_type
+from active6d_bringup.graph.composition import NODES, load_node_type
 
 
 @pytest.fixture(params=NODES)

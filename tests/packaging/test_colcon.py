@@ -9,7 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PREFIX = Path(sys.prefix)
-PACKAGES = ["active6d_agent", "active6d_bringup", "active6d_core", "active6d_perception", "active6d_sim"]
+PACKAGES = [
+    "active6d_agent",
+    "active6d_bringup",
+    "active6d_core",
+    "active6d_perception",
+    "active6d_sim",
+    "active6d_tools",
+]
 NODES = {
     "active6d_sim": ["camera_simulator", "dataset_camera"],
     "active6d_perception": ["pose_estimator", "hypothesis_fusion"],
@@ -28,7 +35,7 @@ def install(tmp_path_factory) -> Path:
     environment = {**os.environ, "AMENT_PREFIX_PATH": str(PREFIX), "PYTHONPATH": ""}
     run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=110)
     assert run.returncode == 0, run.stdout + run.stderr
-    assert "5 packages finished" in run.stdout
+    assert "6 packages finished" in run.stdout
     return space / "install"
 
 
@@ -43,7 +50,7 @@ def environment(install) -> dict[str, str]:
     return dict(entry.split("=", 1) for entry in sourced.stdout.decode().split("\0") if "=" in entry)
 
 
-def test_the_workspace_lists_the_five_packages_as_ament_python():
+def test_the_workspace_lists_the_six_packages_as_ament_python():
     run = subprocess.run(
         [PREFIX / "bin/colcon", "--log-base", os.devnull, "list", "--base-paths", ROOT / "ros2_ws"],
         capture_output=True,
@@ -85,7 +92,7 @@ def test_executables_start(install, environment, package, name):
 
 
 def test_command(install, environment):
-    executable = install / "active6d_bringup/lib/active6d_bringup/active6d"
+    executable = install / "active6d_tools/lib/active6d_tools/active6d"
     run = subprocess.run([executable, "--help"], env=environment, capture_output=True, text=True, timeout=60)
     assert run.returncode == 0, run.stderr
     assert "episode" in run.stdout

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from active6d_bringup.recording import CONTRACT
+from active6d_bringup.bags.writer import CONTRACT
 
 BRINGUP = Path(__file__).parents[2] / "src/active6d_bringup"
 TYPES = {topic.name: topic.type for topic in CONTRACT}

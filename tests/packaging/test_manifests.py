@@ -27,7 +27,7 @@ LIBRARIES = {
     "mcap_ros2": ("mcap-ros2-support", "mcap-ros2-support"),
     "numba": (None, "numba"),
     "numpy": ("python3-numpy", "numpy"),
-    "open3d": ("python3-open3d-pip", "open3d-cpu"),
+    "open3d": (None, "open3d-cpu"),
     "pybullet": ("python3-pybullet-pip", "pybullet"),
     "pybullet_data": ("python3-pybullet-pip", "pybullet"),
     "pybullet_utils": ("python3-pybullet-pip", "pybullet"),
@@ -103,7 +103,8 @@ def test_layers_of_the_packages():
         "active6d_sim": {"active6d_core"},
         "active6d_perception": {"active6d_core"},
         "active6d_agent": {"active6d_core", "active6d_perception"},
-        "active6d_bringup": set(PACKAGES),
+        "active6d_bringup": {"active6d_core", "active6d_perception", "active6d_agent"},
+        "active6d_tools": set(PACKAGES),
     }
     for package in PACKAGES:
         assert imports(package) & set(PACKAGES) <= allowed[package]

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import yaml
 
-from active6d_core.node import GraphNode
+from active6d_core.ros.node import GraphNode
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "src/active6d_bringup/config/active6d.yaml"
-UPDATE = "run scripts/describe_nodes.py"
+UPDATE = "run python -m active6d_tools.describe_nodes"
 
 
 def declared(node: GraphNode) -> dict:

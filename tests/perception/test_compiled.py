@@ -8,7 +8,10 @@ from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception import fusion, model_views, surface, verification, visibility
+from active6d_perception.model import model_views
+from active6d_perception.scene import expected_visibility as visibility
+from active6d_perception.scene import fusion, verification
+from active6d_perception.scene import observed_surface as surface
 
 MODULES = (fusion, model_views, surface, verification, visibility)
 
@@ -26,7 +29,7 @@ def versions():
 def test_no_view_waits_for_the_compiler(render, pose):
     """Neither the first one nor one with read-only images."""
     model = load_object("mug")
-    verifier, scene = verification.Verifier(model), surface.SceneSurface(model)
+    verifier, scene = verification.Verifier(model), surface.ObservedSurface(model)
     visible, fused = visibility.ExpectedVisibility(model), fusion.SceneFusion(model)
     compiled = versions()
     assert sum(compiled.values()) >= 8

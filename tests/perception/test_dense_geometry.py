@@ -1,4 +1,4 @@
-"""The learned estimator's geometry, without learning: gauges, input, bins, votes, rigid fits, turns."""
+"""The learned estimator's geometry, without learning: canonical_frames, input, bins, votes, rigid fits, turns."""
 
 import time
 
@@ -15,10 +15,17 @@ from scipy.special import softmax
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View, backproject, normals_from_points, pixel_rays
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, rotation_angle, transform_points
-from active6d_perception.dense.estimator import likely_turns
-from active6d_perception.dense.gauge import TURNS, Turn, gauge_of, turn_about_z
-from active6d_perception.dense.network import DIRECTION_BINS, HEADS, DenseNetwork, NetworkSize, fused, split
-from active6d_perception.dense.network_input import (
+from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
+from active6d_perception.estimators.dense.canonical_frame import (
+    TURNS,
+    AxisRotation,
+    canonical_frame_of,
+    rotation_about_z,
+)
+from active6d_perception.estimators.dense.estimator import likely_axis_rotations
+from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
+from active6d_perception.estimators.dense.network import DIRECTION_BINS, HEADS, DenseNetwork, NetworkSize, fused, split
+from active6d_perception.estimators.dense.network_input import (
     CHANNELS,
     network_input,
     output_camera,
@@ -27,13 +34,11 @@ from active6d_perception.dense.network_input import (
     ray_rotation,
     reduce_view,
 )
-from active6d_perception.dense.rigid_fit import kabsch, robust_fit
-from active6d_perception.dense.sphere_bins import CENTRES, density, kernel
-from active6d_perception.dense.surface import MeasuredSurface
-from active6d_perception.dense.turns import TurnSearch
-from active6d_perception.dense.votes import cluster_votes
+from active6d_perception.estimators.dense.rigid_fit import kabsch, robust_fit
+from active6d_perception.estimators.dense.sphere_bins import CENTRES, density, kernel
+from active6d_perception.estimators.dense.votes import cluster_votes
 
-OBJECTS = {"coffee_cup": Turn.INVISIBLE, "mug": Turn.TOLD_BY_FEATURE, "bunny": Turn.VISIBLE}
+OBJECTS = {"coffee_cup": AxisRotation.INVISIBLE, "mug": AxisRotation.TOLD_BY_FEATURE, "bunny": AxisRotation.VISIBLE}
 
 
 def random_poses(count, seed=0, distance=0.8):
@@ -44,45 +49,45 @@ def random_poses(count, seed=0, distance=0.8):
 
 @pytest.mark.parametrize(("name", "turn"), OBJECTS.items())
 def test_gauge_is_found_from_the_description(name, turn):
-    assert gauge_of(load_object(name)).turn is turn
+    assert canonical_frame_of(load_object(name)).turn is turn
 
 
 def test_axis_of_the_mug_is_the_axis_of_its_inner_wall():
     model = load_object("mug")
-    gauge = gauge_of(model)
-    assert np.allclose(gauge.T_object_axis[:3, 2], [0, 0, 1])
+    canonical_frame = canonical_frame_of(model)
+    assert np.allclose(canonical_frame.T_object_axis[:3, 2], [0, 0, 1])
     # The body is as wide as it is deep, and the handle sticks out towards +y only.
     low, high = model.mesh.bounds
     radius = (high[0] - low[0]) / 2
-    assert np.allclose(gauge.T_object_axis[:2, 3], [low[0] + radius, low[1] + radius], atol=2e-4)
+    assert np.allclose(canonical_frame.T_object_axis[:2, 3], [low[0] + radius, low[1] + radius], atol=2e-4)
     handle = np.asarray(model.mesh.vertices)[model.feature_mask("handle", np.asarray(model.mesh.vertices))].mean(axis=0)
-    towards = (handle - gauge.T_object_axis[:3, 3])[:2]
-    assert gauge.T_object_axis[:2, 0] @ towards / np.linalg.norm(towards) > 0.999
+    towards = (handle - canonical_frame.T_object_axis[:3, 3])[:2]
+    assert canonical_frame.T_object_axis[:2, 0] @ towards / np.linalg.norm(towards) > 0.999
 
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_canonical_frame_sees_the_camera_in_its_xz_half_plane(name):
-    gauge, poses = gauge_of(load_object(name)), random_poses(50)
-    canonical = gauge.canonical_pose(poses)
-    if gauge.turn is Turn.VISIBLE:
+    canonical_frame, poses = canonical_frame_of(load_object(name)), random_poses(50)
+    canonical = canonical_frame.canonical_pose(poses)
+    if canonical_frame.turn is AxisRotation.VISIBLE:
         assert np.allclose(canonical, poses)
         return
     eye = invert(canonical)[:, :3, 3]
     assert np.allclose(eye[:, 1], 0, atol=1e-9)
     assert (eye[:, 0] > 0).all()
-    assert np.allclose(canonical[:, :3, 2], gauge.axis_pose(poses)[:, :3, 2])
+    assert np.allclose(canonical[:, :3, 2], canonical_frame.axis_pose(poses)[:, :3, 2])
 
 
 def test_canonical_frame_of_a_cup_forgets_its_turn():
-    gauge, poses = gauge_of(load_object("coffee_cup")), random_poses(20)
-    turned = poses @ turn_about_z(np.linspace(0, 6, 20))
-    assert np.allclose(gauge.canonical_pose(poses), gauge.canonical_pose(turned))
+    canonical_frame, poses = canonical_frame_of(load_object("coffee_cup")), random_poses(20)
+    turned = poses @ rotation_about_z(np.linspace(0, 6, 20))
+    assert np.allclose(canonical_frame.canonical_pose(poses), canonical_frame.canonical_pose(turned))
 
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_axis_pose_and_object_pose_are_inverse(name):
-    gauge, poses = gauge_of(load_object(name)), random_poses(5)
-    assert np.allclose(gauge.object_pose(gauge.axis_pose(poses)), poses)
+    canonical_frame, poses = canonical_frame_of(load_object(name)), random_poses(5)
+    assert np.allclose(canonical_frame.object_pose(canonical_frame.axis_pose(poses)), poses)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -252,14 +257,14 @@ def mug_alone(T_camera_mug, camera=PinholeCamera.from_field_of_view(320, 240, 60
     return np.minimum(hit, 1.5).astype(np.float32), camera
 
 
-def turn_likelihood(T_camera_axis, depth, camera, owner=None):
+def axis_rotation_likelihood(T_camera_axis, depth, camera, owner=None):
     model = load_object("mug")
     points = backproject(depth, camera)
     owner = np.where(depth < 1.5, 0, -1) if owner is None else owner
     surface = MeasuredSurface(
         depth, points, normals_from_points(points, reach=1), owner, camera, None, np.zeros((0, 3))
     )
-    return TurnSearch(model, gauge_of(model)).log_likelihood(T_camera_axis[None], surface)[0]
+    return AxisRotationSearch(model, canonical_frame_of(model)).log_likelihood(T_camera_axis[None], surface)[0]
 
 
 def upright_mug(azimuth, elevation=35.0):
@@ -271,24 +276,24 @@ def upright_mug(azimuth, elevation=35.0):
 
 @pytest.mark.parametrize("azimuth", [0, 50, 90, 135, -60, -110])
 def test_turn_search_finds_a_visible_handle(azimuth):
-    gauge = gauge_of(load_object("mug"))
+    canonical_frame = canonical_frame_of(load_object("mug"))
     T_camera_axis = upright_mug(azimuth)
-    depth, camera = mug_alone(gauge.object_pose(T_camera_axis[None])[0])
+    depth, camera = mug_alone(canonical_frame.object_pose(T_camera_axis[None])[0])
     # The search is told the pose with its turn forgotten.
     forgotten = np.random.default_rng(azimuth % 7).uniform(0, 2 * np.pi)
-    found = turn_likelihood(T_camera_axis @ turn_about_z(forgotten), depth, camera)
+    found = axis_rotation_likelihood(T_camera_axis @ rotation_about_z(forgotten), depth, camera)
     error = (TURNS[found.argmax()] + forgotten + np.pi) % (2 * np.pi) - np.pi
     assert np.degrees(abs(error)) < 10
-    turns, certainty = likely_turns(softmax(found)[None], 1)
+    turns, certainty = likely_axis_rotations(softmax(found)[None], 1)
     assert turns[0, 0] == found.argmax()
     assert certainty[0, 0] > 0.99
 
 
 def test_turn_search_tells_that_a_handle_is_hidden():
-    gauge = gauge_of(load_object("mug"))
+    canonical_frame = canonical_frame_of(load_object("mug"))
     T_camera_axis = upright_mug(180, elevation=5.0)
-    depth, camera = mug_alone(gauge.object_pose(T_camera_axis[None])[0])
-    probability = softmax(turn_likelihood(T_camera_axis, depth, camera))
+    depth, camera = mug_alone(canonical_frame.object_pose(T_camera_axis[None])[0])
+    probability = softmax(axis_rotation_likelihood(T_camera_axis, depth, camera))
     # It is behind the mug, and where behind is anybody's guess.
     behind = np.abs((TURNS + np.pi) % (2 * np.pi) - np.pi) < np.radians(50)
     assert probability[behind].sum() > 0.9
@@ -296,16 +301,16 @@ def test_turn_search_tells_that_a_handle_is_hidden():
 
 
 def test_a_handle_may_be_behind_what_hides_it_and_not_where_the_camera_looked_through():
-    gauge = gauge_of(load_object("mug"))
+    canonical_frame = canonical_frame_of(load_object("mug"))
     T_camera_axis = upright_mug(90)
     box = trimesh.creation.box((0.05, 0.2, 0.01))
-    uncovered, camera = mug_alone(gauge.object_pose(T_camera_axis[None])[0])
+    uncovered, camera = mug_alone(canonical_frame.object_pose(T_camera_axis[None])[0])
     x = (T_camera_axis @ [0.06, 0, 0, 1])[0]
     box.apply_translation([np.sign(x) * 0.07 * 0.6 / 0.8, 0, 0.6])
-    covered, _ = mug_alone(gauge.object_pose(T_camera_axis[None])[0], wall=box)
+    covered, _ = mug_alone(canonical_frame.object_pose(T_camera_axis[None])[0], wall=box)
     owner = np.where(np.abs(covered - uncovered) < 1e-4, 0, -1)
-    probability = softmax(turn_likelihood(T_camera_axis, covered, camera, owner))
-    _, certainty = likely_turns(probability[None], 1)
+    probability = softmax(axis_rotation_likelihood(T_camera_axis, covered, camera, owner))
+    _, certainty = likely_axis_rotations(probability[None], 1)
     true_side = np.abs((TURNS + np.pi) % (2 * np.pi) - np.pi) < np.radians(40)
     other_side = np.abs(TURNS - np.pi) < np.radians(40)
     assert certainty[0, 0] < 0.8
@@ -314,9 +319,9 @@ def test_a_handle_may_be_behind_what_hides_it_and_not_where_the_camera_looked_th
 
 def test_a_network_with_the_wrong_owner_does_not_hide_the_handle():
     # All pixels off the body went to a neighbour; they are still nobody else's body.
-    model, gauge = load_object("mug"), gauge_of(load_object("mug"))
+    model, canonical_frame = load_object("mug"), canonical_frame_of(load_object("mug"))
     T_camera_axis = upright_mug(90)
-    depth, camera = mug_alone(gauge.object_pose(T_camera_axis[None])[0])
+    depth, camera = mug_alone(canonical_frame.object_pose(T_camera_axis[None])[0])
     points = backproject(depth, camera)
     local = transform_points(invert(T_camera_axis), points)
     handle = (depth < 1.5) & (np.hypot(local[..., 0], local[..., 1]) > 0.046)
@@ -327,33 +332,33 @@ def test_a_network_with_the_wrong_owner_does_not_hide_the_handle():
     )
     elsewhere = T_camera_axis.copy()
     elsewhere[0, 3] += 0.3
-    found = TurnSearch(model, gauge).log_likelihood(np.stack([T_camera_axis, elsewhere]), surface)[0]
+    found = AxisRotationSearch(model, canonical_frame).log_likelihood(np.stack([T_camera_axis, elsewhere]), surface)[0]
     assert np.degrees(abs((TURNS[found.argmax()] + np.pi) % (2 * np.pi) - np.pi)) < 10
-    assert likely_turns(softmax(found)[None], 1)[1] > 0.9
+    assert likely_axis_rotations(softmax(found)[None], 1)[1] > 0.9
 
 
 def test_turns_of_many_mugs_are_those_of_each_alone():
-    model, gauge = load_object("mug"), gauge_of(load_object("mug"))
-    T_camera_axis = np.stack([upright_mug(90), upright_mug(-60) @ turn_about_z(1.0)])
-    depth, camera = mug_alone(gauge.object_pose(T_camera_axis[:1])[0])
+    model, canonical_frame = load_object("mug"), canonical_frame_of(load_object("mug"))
+    T_camera_axis = np.stack([upright_mug(90), upright_mug(-60) @ rotation_about_z(1.0)])
+    depth, camera = mug_alone(canonical_frame.object_pose(T_camera_axis[:1])[0])
     points = backproject(depth, camera)
     owner = np.where(depth < 1.5, 0, -1)
     surface = MeasuredSurface(
         depth, points, normals_from_points(points, reach=1), owner, camera, None, np.zeros((0, 3))
     )
-    search = TurnSearch(model, gauge)
+    search = AxisRotationSearch(model, canonical_frame)
     together = search.log_likelihood(T_camera_axis, surface)
     assert np.allclose(together[0], search.log_likelihood(T_camera_axis[:1], surface)[0])
     # Starting from another turn shifts the answer and changes nothing else.
     step = 2 * np.pi / len(TURNS)
-    shifted = search.log_likelihood(T_camera_axis[:1] @ turn_about_z(7 * step), surface)[0]
+    shifted = search.log_likelihood(T_camera_axis[:1] @ rotation_about_z(7 * step), surface)[0]
     assert np.allclose(np.roll(shifted, 7), together[0], atol=1.5)
 
 
 def test_likely_turns_lie_apart():
     probability = np.exp(-(np.minimum(TURNS, 2 * np.pi - TURNS) ** 2) * 20)
     probability += 0.5 * np.roll(probability, 30)
-    turns, certainty = likely_turns((probability / probability.sum())[None], 2)
+    turns, certainty = likely_axis_rotations((probability / probability.sum())[None], 2)
     assert turns.tolist() == [[0, 30]]
     assert np.allclose(certainty, [[2 / 3, 1 / 3]], atol=0.02)
 

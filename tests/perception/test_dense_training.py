@@ -11,24 +11,24 @@ from active6d_core.camera import DEFAULT_CAMERA, View, backproject
 from active6d_core.metrics import e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, transform_points
-from active6d_perception.dense.decoding import DecodingParameters
-from active6d_perception.dense.estimator import DenseEstimator, DenseParameters
-from active6d_perception.dense.gauge import Turn, gauge_of
-from active6d_perception.dense.network import HEADS, DenseNetwork, NetworkSize, split
-from active6d_perception.dense.network_input import output_camera, ray_frames, ray_rotation, reduction
-from active6d_perception.dense.sphere_bins import CENTRES
-from active6d_perception.dense.weights_file import TrainedNetwork, load_network, save_network
-from active6d_perception.estimator import create_estimator, list_estimators
-from active6d_perception.training.augmentation import augment, crop
-from active6d_perception.training.batches import TrainingViews, batches, input_tensor
-from active6d_perception.training.loop import TrainingOptions, train
-from active6d_perception.training.losses import LossWeights, loss_terms, total
-from active6d_perception.training.samples import make_sample, read_shard, write_shard
-from active6d_perception.training.targets import make_targets
-from active6d_perception.training.validation import validate
-from active6d_sim.renderer import SceneRenderer
-from active6d_sim.scene import Bin, Scene
-from active6d_sim.training_views import FIRST_SEED, random_camera, training_heap
+from active6d_perception.estimators.dense.canonical_frame import AxisRotation, canonical_frame_of
+from active6d_perception.estimators.dense.decoding import DecodingParameters
+from active6d_perception.estimators.dense.estimator import DenseEstimator, DenseParameters
+from active6d_perception.estimators.dense.network import HEADS, DenseNetwork, NetworkSize, split
+from active6d_perception.estimators.dense.network_input import output_camera, ray_frames, ray_rotation, reduction
+from active6d_perception.estimators.dense.sphere_bins import CENTRES
+from active6d_perception.estimators.dense.trained_network import TrainedNetwork, load_network, save_network
+from active6d_perception.estimators.dense.training.augmentation import augment, crop
+from active6d_perception.estimators.dense.training.batches import TrainingViews, batches, input_tensor
+from active6d_perception.estimators.dense.training.loop import TrainingOptions, train
+from active6d_perception.estimators.dense.training.losses import LossWeights, loss_terms, total
+from active6d_perception.estimators.dense.training.samples import make_sample, read_shard, write_shard
+from active6d_perception.estimators.dense.training.targets import make_targets
+from active6d_perception.estimators.dense.training.validation import validate
+from active6d_perception.estimators.registry import create_estimator, list_estimators
+from active6d_sim.datasets.training_views import FIRST_SEED, random_camera, training_heap
+from active6d_sim.rendering.renderer import SceneRenderer
+from active6d_sim.scenes.scene import Bin, Scene
 
 SMALL = NetworkSize((8, 12, 16, 24), 16)
 OBJECTS = ("coffee_cup", "mug", "bunny")
@@ -76,13 +76,13 @@ def right_answer(sample, targets):
 def test_targets_agree_with_the_renderer(name):
     sample, coordinates, _ = view_of(name)
     model = load_object(name)
-    gauge = gauge_of(model)
-    targets = make_targets(sample, gauge, model.diameter)
+    canonical_frame = canonical_frame_of(model)
+    targets = make_targets(sample, canonical_frame, model.diameter)
     rendered = coordinates.reshape(-1, 3)[targets.pixel]
     instance = sample.instance.ravel()[targets.pixel]
     # Back from canonical coordinates to the object's frame by the poses alone.
-    to_object = invert(sample.T_camera_object) @ gauge.canonical_pose(sample.T_camera_object)
-    if gauge.turn is Turn.INVISIBLE:
+    to_object = invert(sample.T_camera_object) @ canonical_frame.canonical_pose(sample.T_camera_object)
+    if canonical_frame.turn is AxisRotation.INVISIBLE:
         about = [np.hypot(*rendered[:, :2].T), rendered[:, 2]]
         said = targets.coordinates * model.diameter
         assert np.allclose([np.hypot(*said[:, :2].T), said[:, 2]], about, atol=5e-4)
@@ -93,16 +93,18 @@ def test_targets_agree_with_the_renderer(name):
     points = backproject(sample.surface_depth, camera).reshape(-1, 3)[targets.pixel]
     R = ray_frames(camera).reshape(-1, 3, 3)[targets.pixel]
     votes = points + model.diameter * np.einsum("pij,pj->pi", R, targets.centre)
-    origin = transform_points(sample.T_camera_object, gauge.T_object_axis[None, :3, 3])[:, 0]
+    origin = transform_points(sample.T_camera_object, canonical_frame.T_object_axis[None, :3, 3])[:, 0]
     assert np.allclose(votes, origin[instance], atol=1e-5)
     frames = ray_rotation(origin)
-    axis = (sample.T_camera_object[:, :3, :3] @ gauge.T_object_axis[:3, 2])[instance]
+    axis = (sample.T_camera_object[:, :3, :3] @ canonical_frame.T_object_axis[:3, 2])[instance]
     assert np.allclose(np.einsum("pij,pj->pi", frames[instance], targets.axis), axis, atol=1e-5)
-    if gauge.turn is Turn.INVISIBLE:
+    if canonical_frame.turn is AxisRotation.INVISIBLE:
         assert not targets.direction.any()
     else:
         x = np.einsum(
-            "nij,nj->ni", frames.swapaxes(1, 2), sample.T_camera_object[:, :3, :3] @ gauge.T_object_axis[:3, 0]
+            "nij,nj->ni",
+            frames.swapaxes(1, 2),
+            sample.T_camera_object[:, :3, :3] @ canonical_frame.T_object_axis[:3, 0],
         )
         assert (targets.direction.argmax(axis=1) == (x @ CENTRES.T).argmax(axis=1)[instance]).all()
         assert np.allclose(targets.direction.sum(axis=1), 1, atol=1e-5)
@@ -114,10 +116,10 @@ def test_targets_agree_with_the_renderer(name):
 def test_a_right_answer_gives_right_poses(name, coordinates):
     sample, _, _ = view_of(name)
     model = load_object(name)
-    gauge = gauge_of(model)
-    answer = right_answer(sample, make_targets(sample, gauge, model.diameter))
+    canonical_frame = canonical_frame_of(model)
+    answer = right_answer(sample, make_targets(sample, canonical_frame, model.diameter))
     parameters = DenseParameters(decoding=DecodingParameters(coordinates=coordinates))
-    trained = TrainedNetwork(DenseNetwork(SMALL), gauge, name, model.diameter, SMALL)
+    trained = TrainedNetwork(DenseNetwork(SMALL), canonical_frame, name, model.diameter, SMALL)
     estimator = DenseEstimator(model, trained, parameters)
     estimator.ask = lambda view: answer
     poses, label = estimator.locate(sample.view)
@@ -134,19 +136,21 @@ def test_a_right_answer_gives_right_poses(name, coordinates):
 
 def test_a_hidden_handle_is_told():
     model = load_object("mug")
-    gauge = gauge_of(model)
+    canonical_frame = canonical_frame_of(model)
     away = (PLACES - EYE) / np.linalg.norm(PLACES - EYE, axis=1, keepdims=True)
     beside = np.cross(away, [0, 0, 1])
     beside /= np.linalg.norm(beside, axis=1, keepdims=True)
     towards = np.stack([away[0], beside[1], away[2], beside[3]])  # where the handles point
     up = np.cross(away, beside)
-    rotations = np.stack([towards, np.cross(up, towards), up], axis=-1) @ gauge.T_object_axis[:3, :3].T
+    rotations = np.stack([towards, np.cross(up, towards), up], axis=-1) @ canonical_frame.T_object_axis[:3, :3].T
     sample, _, _ = view_of("mug", rotations=rotations)
     for network_knows in (False, True):
-        answer = right_answer(sample, make_targets(sample, gauge, model.diameter))
+        answer = right_answer(sample, make_targets(sample, canonical_frame, model.diameter))
         if not network_knows:
             split(answer, axis=0)["direction"][:] = 0
-        estimator = DenseEstimator(model, TrainedNetwork(DenseNetwork(SMALL), gauge, "mug", model.diameter, SMALL))
+        estimator = DenseEstimator(
+            model, TrainedNetwork(DenseNetwork(SMALL), canonical_frame, "mug", model.diameter, SMALL)
+        )
         estimator.ask = lambda view, answer=answer: answer
         poses, _ = estimator.locate(sample.view)
         errors = e_add(model, poses.T_camera_object[:, None], sample.T_camera_object[None])
@@ -215,7 +219,7 @@ def test_a_crop_has_the_targets_of_the_whole(mug_view):
     camera, whole = cropped.view.camera, sample.view.camera
     top, left = round(whole.cy - camera.cy), round(whole.cx - camera.cx)
     assert (cropped.view.color == sample.view.color[top : top + 96, left : left + 128]).all()
-    part, full = (make_targets(item, gauge_of(model), model.diameter) for item in (cropped, sample))
+    part, full = (make_targets(item, canonical_frame_of(model), model.diameter) for item in (cropped, sample))
     row, column = np.divmod(part.pixel, 64)
     place = np.searchsorted(full.pixel, (row + top // 2) * 160 + column + left // 2)
     for name in ("centre", "coordinates", "axis", "direction"):
@@ -223,7 +227,7 @@ def test_a_crop_has_the_targets_of_the_whole(mug_view):
 
 
 def test_heaps_to_learn_from_share_no_seed_with_stored_scenes():
-    from active6d_sim.scene_store import SPLIT_SEEDS, SPLITS
+    from active6d_sim.scenes.scene_store import SPLIT_SEEDS, SPLITS
 
     assert all(SPLIT_SEEDS[split] + count <= FIRST_SEED for split, count in SPLITS.items())
     with pytest.raises(ValueError, match="seeds from"):
@@ -242,7 +246,7 @@ def test_random_cameras_look_at_the_bin_from_above():
 def test_loss_is_least_at_the_right_answer(mug_view):
     sample, _, _ = mug_view
     model = load_object("mug")
-    targets = make_targets(sample, gauge_of(model), model.diameter)
+    targets = make_targets(sample, canonical_frame_of(model), model.diameter)
     right = torch.from_numpy(right_answer(sample, targets))[None]
     best = loss_terms(right, [targets])
     for name, part in split(torch.arange(right.shape[1])[None]).items():
@@ -259,7 +263,7 @@ def test_scale_is_learned_from_the_error(mug_view):
     """The likelihood is largest where the scale is the mean error over three."""
     sample, _, _ = mug_view
     model = load_object("mug")
-    targets = make_targets(sample, gauge_of(model), model.diameter)
+    targets = make_targets(sample, canonical_frame_of(model), model.diameter)
     answer = torch.from_numpy(right_answer(sample, targets))[None]
     parts = split(answer)
     parts["centre"][:, 0] += 0.3
@@ -276,8 +280,8 @@ def test_a_small_network_learns_a_view_by_heart(mug_view):
     torch.set_num_threads(1)
     sample, _, view = view_of("coffee_cup", camera=DEFAULT_CAMERA.scaled(0.3))
     model = load_object("coffee_cup")
-    gauge = gauge_of(model)
-    targets = make_targets(sample, gauge, model.diameter)
+    canonical_frame = canonical_frame_of(model)
+    targets = make_targets(sample, canonical_frame, model.diameter)
     inputs = input_tensor(sample.view, model.diameter)[None].contiguous(memory_format=torch.channels_last)
     size = NetworkSize((16, 24, 32, 48), 24)
     network = DenseNetwork(size).to(memory_format=torch.channels_last)
@@ -290,7 +294,7 @@ def test_a_small_network_learns_a_view_by_heart(mug_view):
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.3 * losses[0]
-    estimator = DenseEstimator(model, TrainedNetwork(network, gauge, model.name, model.diameter, size))
+    estimator = DenseEstimator(model, TrainedNetwork(network, canonical_frame, model.name, model.diameter, size))
     hypotheses = estimator.estimate(view)
     errors = e_add(model, hypotheses.T_camera_object[:, None], sample.T_camera_object[None])
     assert len(hypotheses) == 4
@@ -347,16 +351,18 @@ def test_training_goes_on_where_it_stopped(tmp_path, trained, mug_view):
 def test_validation_rates_a_perfect_network(mug_view, monkeypatch):
     sample, _, _ = mug_view
     model = load_object("mug")
-    gauge = gauge_of(model)
-    answer = right_answer(sample, make_targets(sample, gauge, model.diameter))
+    canonical_frame = canonical_frame_of(model)
+    answer = right_answer(sample, make_targets(sample, canonical_frame, model.diameter))
     monkeypatch.setattr(DenseEstimator, "ask", lambda self, view: answer)
-    rates = validate(model, TrainedNetwork(DenseNetwork(SMALL).eval(), gauge, "mug", model.diameter, SMALL), [sample])
+    rates = validate(
+        model, TrainedNetwork(DenseNetwork(SMALL).eval(), canonical_frame, "mug", model.diameter, SMALL), [sample]
+    )
     assert rates["add_half"] == rates["add_tenth"] == rates["adds_half"] == rates["precision"] == 1.0
 
 
 def test_no_views_is_said(tmp_path):
     with pytest.raises(ValueError, match="no training views"):
-        next(batches(TrainingViews([], gauge_of(load_object("mug")), 0.14, (0,)), 1, 0))
+        next(batches(TrainingViews([], canonical_frame_of(load_object("mug")), 0.14, (0,)), 1, 0))
 
 
 def test_dense_is_registered_and_takes_weights(trained):

@@ -11,9 +11,9 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform, transform_points
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.fusion import FusionParameters, SceneFusion, cluster, project_features, select
-from active6d_perception.model_views import model_views
-from active6d_perception.symmetric_distance import SymmetricDistance
+from active6d_perception.model.model_views import model_views
+from active6d_perception.model.symmetric_distance import SymmetricDistance
+from active6d_perception.scene.fusion import FusionParameters, SceneFusion, cluster, project_features, select
 
 NAMES = ("coffee_cup", "bunny", "mug")
 SPHERE = ViewSphere()
@@ -223,7 +223,7 @@ def test_bad_parameters_and_scores_are_named():
     with pytest.raises(ValueError, match="cut must be positive"):
         FusionParameters(cut=0.0)
     with pytest.raises(ValueError, match="rank_by must be one of evidence, confidence, verification, score"):
-        FusionParameters(rank_by="luck")
+        FusionParameters(rank_by="noise-resampling")
     with pytest.raises(ValueError, match="min_verification"):
         FusionParameters(min_verification=2.0)
     _, episode = make_episode(0)

@@ -12,18 +12,18 @@ from active6d_core.metrics import add_s, e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception import estimator as estimator_module
-from active6d_perception.estimator import (
+from active6d_perception.estimators import registry as estimator_module
+from active6d_perception.estimators.refinement import suppress
+from active6d_perception.estimators.registry import (
     choose_estimator,
     create_estimator,
     list_estimators,
     register_estimator,
     weights_path,
 )
-from active6d_perception.evaluation import LabelledView, detection_over_views, evaluate_estimator
-from active6d_perception.refinement import suppress
-from active6d_sim.heap import drop_heap
-from active6d_sim.simulator import Simulator
+from active6d_perception.estimators.single_view_evaluation import LabelledView, detection_over_views, evaluate_estimator
+from active6d_sim.physics.heap import drop_heap
+from active6d_sim.rendering.simulator import Simulator
 
 SPHERE = ViewSphere()
 NAMES = ("coffee_cup", "bunny", "mug")
@@ -114,7 +114,8 @@ def test_registry_names_what_it_knows():
 def test_the_geometric_estimator_needs_no_torch():
     code = (
         "import sys; from active6d_core.object_model import load_object;"
-        "from active6d_perception.estimator import create_estimator; create_estimator('geometric', load_object('mug'));"
+        "from active6d_perception.estimators.registry import create_estimator;"
+        "create_estimator('geometric', load_object('mug'));"
         "sys.exit('torch' in sys.modules or 'rclpy' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=100).returncode == 0

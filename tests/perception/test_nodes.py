@@ -9,7 +9,9 @@ from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from active6d_core.camera import DEFAULT_CAMERA
-from active6d_core.conversions import (
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.object_model import load_object
+from active6d_core.ros.conversions import (
     camera_to_info,
     color_to_image,
     depth_to_image,
@@ -23,16 +25,14 @@ from active6d_core.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.hypotheses import Hypotheses
-from active6d_core.object_model import load_object
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimator import register_estimator
-from active6d_perception.fusion import SceneFusion
+from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.nodes.hypothesis_fusion import HypothesisFusionNode
 from active6d_perception.nodes.pose_estimator import PoseEstimatorNode
-from active6d_perception.surface import SceneSurface, SurfaceGrid
-from active6d_perception.verification import Verifier
+from active6d_perception.scene.fusion import SceneFusion
+from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
+from active6d_perception.scene.verification import Verifier
 
 FRAME = "camera_optical_frame"
 CAMERA = DEFAULT_CAMERA.scaled(0.25)
@@ -243,7 +243,7 @@ def box_on_the_floor(stamp, left=60):
 
 
 def unexplained_by_nothing(depths, grid=None):
-    surface = SceneSurface(load_object("mug"), grid)
+    surface = ObservedSurface(load_object("mug"), grid)
     for stamp, depth in enumerate(depths):
         surface.add_view(stamp, depth, CAMERA, SPHERE.pose(SPHERE.positions[3]))
     return surface.unexplained(np.zeros((0, 4, 4)))

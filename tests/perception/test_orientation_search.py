@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from active6d_core.camera import PinholeCamera, backproject, normals_from_points, pixel_rays
 from active6d_core.object_model import load_object
 from active6d_core.se3 import is_rigid, make_transform, transform_points
-from active6d_perception.dense.decoding import Instances
-from active6d_perception.dense.network import DIRECTION_BINS
-from active6d_perception.dense.orientation_search import OrientationSearch
-from active6d_perception.dense.surface import MeasuredSurface
+from active6d_perception.estimators.dense.decoding import Instances
+from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
+from active6d_perception.estimators.dense.network import DIRECTION_BINS
+from active6d_perception.estimators.dense.orientation_search import OrientationSearch
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240, 60.0)
 

@@ -4,10 +4,10 @@ import pytest
 
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimator import choose_estimator, create_estimator
-from active6d_perception.evaluation import LabelledView, evaluate_estimator
-from active6d_sim.scene_store import load_scene
-from active6d_sim.simulator import Simulator
+from active6d_perception.estimators.registry import choose_estimator, create_estimator
+from active6d_perception.estimators.single_view_evaluation import LabelledView, evaluate_estimator
+from active6d_sim.rendering.simulator import Simulator
+from active6d_sim.scenes.scene_store import load_scene
 
 SPHERE = ViewSphere()
 VIEWS = (5, 31, 52, 78)

@@ -11,7 +11,7 @@ from active6d_core.camera import DEFAULT_CAMERA, backproject
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.se3 import make_transform
-from active6d_perception.verification import Verifier, local_fit, points_and_normals
+from active6d_perception.scene.verification import Verifier, local_fit, points_and_normals
 
 EPSILON = 0.010
 

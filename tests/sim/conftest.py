@@ -3,8 +3,8 @@
 import pytest
 
 from active6d_core.object_model import load_object
-from active6d_sim.heap import drop_heap
-from active6d_sim.scene import Scene
+from active6d_sim.physics.heap import drop_heap
+from active6d_sim.scenes.scene import Scene
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.se3 import invert, look_at, make_transform
-from active6d_sim.bop import BopScene, write_bop_scene
+from active6d_sim.datasets.bop import BopScene, write_bop_scene
 
 EYES = [(0.5, 0.1, 0.6), (-0.4, 0.5, 0.5), (0.02, -0.7, 0.4)]
 ROTATIONS = Rotation.from_euler("xyz", [[10, 20, 30], [200, -40, 5], [0, 0, 90], [-70, 80, 160]], degrees=True)

@@ -11,7 +11,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
 from active6d_core.camera import PinholeCamera
-from active6d_core.conversions import (
+from active6d_core.ros.conversions import (
     image_to_color,
     image_to_depth,
     info_to_camera,
@@ -22,8 +22,8 @@ from active6d_core.conversions import (
 )
 from active6d_core.se3 import look_at
 from active6d_sim.nodes.camera_simulator import CameraSimulatorNode
-from active6d_sim.sensor import SensorNoise
-from active6d_sim.simulator import Simulator
+from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.simulator import Simulator
 
 SECOND = 1_000_000_000
 TOPICS = {

@@ -8,7 +8,7 @@ from hand_made_scenes import CAMERA, SPHERE, three_mugs
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
-from active6d_core.conversions import (
+from active6d_core.ros.conversions import (
     image_to_color,
     image_to_depth,
     info_to_camera,
@@ -18,9 +18,9 @@ from active6d_core.conversions import (
     transform_to_pose_stamped,
 )
 from active6d_core.se3 import look_at
-from active6d_sim.bop import write_bop_scene
+from active6d_sim.datasets.bop import write_bop_scene
 from active6d_sim.nodes.dataset_camera import DatasetCameraNode
-from active6d_sim.simulator import Simulator
+from active6d_sim.rendering.simulator import Simulator
 
 SECOND = 1_000_000_000
 #: Recorded by hand: not on the grid, not at the hemisphere's radius, not facing its centre.

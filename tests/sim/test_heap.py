@@ -7,9 +7,9 @@ import trimesh
 
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, is_rigid, transform_points
-from active6d_sim import heap
-from active6d_sim.bullet import connect
-from active6d_sim.scene import Bin, Scene
+from active6d_sim.physics import heap
+from active6d_sim.physics.bullet import connect
+from active6d_sim.scenes.scene import Bin, Scene
 
 
 def closed_part(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

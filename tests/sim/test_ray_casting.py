@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from active6d_core.camera import pixel_rays
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, transform_points
-from active6d_sim.renderer import SceneRenderer, visible_fractions
-from active6d_sim.scene import Bin
+from active6d_sim.rendering.renderer import SceneRenderer, visible_fractions
+from active6d_sim.scenes.scene import Bin
 
 BRICK = np.array([0.10, 0.06, 0.04])
 WIDE = Bin(2.0, 2.0, 0.0, 0.01)

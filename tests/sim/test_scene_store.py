@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hand_made_scenes import SPHERE, store_mugs
 
-from active6d_sim import scene_store
-from active6d_sim.scene import Bin, Scene
-from active6d_sim.scene_store import (
+from active6d_sim.scenes import scene_store
+from active6d_sim.scenes.scene import Bin, Scene
+from active6d_sim.scenes.scene_store import (
     FIRST_STORED_SEED,
     SPLIT_SEEDS,
     SPLITS,

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from active6d_core.camera import PinholeCamera, pixel_rays
-from active6d_sim.renderer import RenderedView
-from active6d_sim.sensor import SensorNoise, apply
+from active6d_sim.rendering.renderer import RenderedView
+from active6d_sim.rendering.sensor import SensorNoise, apply
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240, 60.0)
 NOTHING = SensorNoise.off()

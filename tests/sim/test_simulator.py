@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from active6d_core.se3 import look_at
-from active6d_sim.renderer import SceneRenderer
-from active6d_sim.sensor import SensorNoise
-from active6d_sim.simulator import GoalError, Simulator, admit_goal, arrival
+from active6d_sim.rendering.renderer import SceneRenderer
+from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.simulator import GoalError, Simulator, admit_goal, arrival
 
 SECOND = 1_000_000_000
 

@@ -8,8 +8,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 
-from active6d_agent.policy import Decision, Observation, choose_policy, create_policy, list_policies
-from active6d_core.conversions import (
+from active6d_agent.policies.registry import Decision, Observation, choose_policy, create_policy, list_policies
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.object_model import load_object
+from active6d_core.registry import AUTOMATIC
+from active6d_core.ros.conversions import (
     MessageError,
     attention_to_cloud,
     make_header,
@@ -19,10 +22,7 @@ from active6d_core.conversions import (
     stamp_to_ns,
     transform_to_pose,
 )
-from active6d_core.hypotheses import SceneObjects
-from active6d_core.node import GraphNode, StampSynchronizer, run_node
-from active6d_core.object_model import load_object
-from active6d_core.registry import AUTOMATIC
+from active6d_core.ros.node import GraphNode, StampSynchronizer, run_node
 from active6d_core.view_sphere import ViewSphere
 
 

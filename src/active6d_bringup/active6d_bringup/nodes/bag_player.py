@@ -8,10 +8,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
-from active6d_bringup.bag import BagError, open_bag, topic_names
-from active6d_bringup.recording import CAMERA_TOPICS, CONTRACT, END, stamp_of
-from active6d_core.conversions import make_header, stamp_to_ns
-from active6d_core.node import GraphNode, run_node
+from active6d_bringup.bags.reader import BagError, open_bag, topic_names
+from active6d_bringup.bags.writer import CAMERA_TOPICS, CONTRACT, END, stamp_of
+from active6d_core.ros.conversions import make_header, stamp_to_ns
+from active6d_core.ros.node import GraphNode, run_node
 
 _REPLAYED = (*CAMERA_TOPICS, *(topic for topic in CONTRACT if topic.name in ("episode/start", "ground_truth/poses")))
 

@@ -9,8 +9,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from active6d_bringup.recording import CONTRACT, END, EpisodeWriter, RecordedTopic, describe_missing
-from active6d_core.node import GraphNode, run_node
+from active6d_bringup.bags.writer import CONTRACT, END, EpisodeWriter, RecordedTopic, describe_missing
+from active6d_core.ros.node import GraphNode, run_node
 
 
 class EpisodeRecorderNode(GraphNode):

@@ -14,7 +14,10 @@ from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from active6d_core.camera import PinholeCamera
-from active6d_core.conversions import (
+from active6d_core.files import cache_folder
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.ros.conversions import (
     MessageError,
     hypotheses_from_cloud,
     image_to_segmentation,
@@ -25,15 +28,12 @@ from active6d_core.conversions import (
     require_frame,
     stamp_to_ns,
 )
-from active6d_core.files import cache_folder
-from active6d_core.hypotheses import SceneObjects
-from active6d_core.node import GraphNode, run_node
-from active6d_core.object_model import ObjectModel, load_object
-from active6d_core.optional_outputs import DetectionOutput
-from active6d_perception.fusion import RANKINGS, FusionParameters, SceneFusion
-from active6d_perception.nodes.view_inputs import ViewInputs
-from active6d_perception.surface import SceneSurface, SurfaceGrid
-from active6d_perception.verification import Verifier
+from active6d_core.ros.node import GraphNode, run_node
+from active6d_core.ros.optional_outputs import DetectionOutput
+from active6d_core.ros.view_inputs import ViewInputs
+from active6d_perception.scene.fusion import RANKINGS, FusionParameters, SceneFusion
+from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
+from active6d_perception.scene.verification import Verifier
 
 
 class HypothesisFusionNode(GraphNode):
@@ -119,7 +119,7 @@ class HypothesisFusionNode(GraphNode):
         self._model = load_object(self._object)
         self._verifier = Verifier(self._model, self._epsilon, self._samples)
         self._fusion = SceneFusion(self._model, self._fusion_parameters)
-        self._surface = SceneSurface(self._model, self._make_grid(), self._fusion_parameters.explained_within)
+        self._surface = ObservedSurface(self._model, self._make_grid(), self._fusion_parameters.explained_within)
         try:
             self._mesh_uri = export_mesh(self._model)
         except (OSError, RuntimeError) as error:  # RuntimeError: there is no home

@@ -8,12 +8,12 @@ from geometry_msgs.msg import PoseArray
 from sensor_msgs.msg import Image, PointCloud2
 
 from active6d_core.camera import View
-from active6d_core.conversions import hypotheses_to_cloud, poses_to_array, segmentation_to_image
-from active6d_core.node import GraphNode, run_node
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
-from active6d_perception.estimator import Estimator, create_estimator, list_estimators
-from active6d_perception.nodes.view_inputs import ViewInputs
+from active6d_core.ros.conversions import hypotheses_to_cloud, poses_to_array, segmentation_to_image
+from active6d_core.ros.node import GraphNode, run_node
+from active6d_core.ros.view_inputs import ViewInputs
+from active6d_perception.estimators.registry import Estimator, create_estimator, list_estimators
 
 
 class PoseEstimatorNode(GraphNode):

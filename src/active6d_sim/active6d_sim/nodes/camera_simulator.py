@@ -6,11 +6,11 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from active6d_core.camera import PinholeCamera, View
-from active6d_core.node import run_node
+from active6d_core.ros.node import run_node
 from active6d_sim.nodes.moving_camera import MovingCameraNode
-from active6d_sim.scene_store import SPLITS, find_scene
-from active6d_sim.sensor import SensorNoise
-from active6d_sim.simulator import Simulator, admit_goal
+from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.simulator import Simulator, admit_goal
+from active6d_sim.scenes.scene_store import SPLITS, find_scene
 
 
 class CameraSimulatorNode(MovingCameraNode):

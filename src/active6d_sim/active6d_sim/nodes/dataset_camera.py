@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 
 from active6d_core.camera import View
-from active6d_core.conversions import MessageError
-from active6d_core.node import run_node
-from active6d_sim.bop import BopScene
+from active6d_core.ros.conversions import MessageError
+from active6d_core.ros.node import run_node
+from active6d_sim.datasets.bop import BopScene
 from active6d_sim.nodes.moving_camera import MovingCameraNode
-from active6d_sim.simulator import admit_goal
+from active6d_sim.rendering.simulator import admit_goal
 
 
 class DatasetCameraNode(MovingCameraNode):

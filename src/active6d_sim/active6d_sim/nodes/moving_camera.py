@@ -11,7 +11,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
 from active6d_core.camera import View
-from active6d_core.conversions import (
+from active6d_core.ros.conversions import (
     MessageError,
     camera_to_info,
     color_to_image,
@@ -22,10 +22,10 @@ from active6d_core.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.node import GraphNode
-from active6d_core.optional_outputs import TransformOutput
+from active6d_core.ros.node import GraphNode
+from active6d_core.ros.optional_outputs import TransformOutput
 from active6d_core.view_sphere import ViewSphere
-from active6d_sim.simulator import NANOSECONDS, GoalError, arrival
+from active6d_sim.rendering.simulator import NANOSECONDS, GoalError, arrival
 
 
 class MovingCameraNode(GraphNode):

@@ -1,0 +1,347 @@
+"""Scene banks: what the deployed estimator and verification said in every view of every scene.
+
+The agent trains and is evaluated on look-ups in a bank, which is thousands of times faster than rendering. A bank is
+one compressed ``.npz`` per object and split, without pickled data: hypotheses as tables, in the camera's frame and in
+float32 as the graph's messages carry them; the true poses; the e_ADD of every hypothesis against every object that it
+is within 50 mm of (all that scoring needs); each view's entropy; and the surface that each view's depth image shows, as
+one bit a cell of a grid over the bin.
+"""
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from active6d_core.camera import View
+from active6d_core.files import cache_folder
+from active6d_core.metrics import MISSED_E_ADD, e_add
+from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.estimators.registry import Estimator
+from active6d_perception.scene.observed_surface import SurfaceGrid
+from active6d_perception.scene.verification import Verifier
+
+FORMAT = 2
+SHIPPED_BANKS = Path(__file__).parent / "shipped"
+_HYPOTHESIS_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw", "verification", "score", "x0", "y0", "x1", "y1", "depth")
+
+
+@dataclass(frozen=True, eq=False)
+class BankScene:
+    """One scene: H hypotheses over the M views of the grid, and the truth.
+
+    Attributes:
+        name: of the scene, such as ``mug/test/3``.
+        T_world_object: (n, 4, 4) true poses.
+        view: (H,) int, the view that each hypothesis is from, not falling.
+        table: (H, 14) float32: position (3) and quaternion (4) in the optical frame, verification score, the
+            estimator's score, box (4), depth.
+        errors: (H, n) float32 e_ADD in metres, ``inf`` from 50 mm on.
+        entropy: (M,) entropy of each view's masks, nats.
+        surface: (M, ceil(cells / 8)) uint8, packed bits: the cells of the bank's grid that each view shows surface in.
+
+    Raises:
+        ValueError: shapes disagree, or a number is not finite.
+    """
+
+    name: str
+    T_world_object: np.ndarray
+    view: np.ndarray
+    table: np.ndarray
+    errors: np.ndarray
+    entropy: np.ndarray
+    surface: np.ndarray
+
+    def __post_init__(self) -> None:
+        H, n = len(self.view), len(self.T_world_object)
+        shapes = {"T_world_object": (n, 4, 4), "table": (H, len(_HYPOTHESIS_COLUMNS)), "errors": (H, n)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{self.name}: {name} has shape {getattr(self, name).shape}, expected {shape}")
+        if np.any(np.diff(self.view) < 0) or np.any(self.view < 0) or np.any(self.view >= len(self.entropy)):
+            raise ValueError(f"{self.name}: views of hypotheses must be in order and below {len(self.entropy)}")
+        if not all(np.isfinite(values).all() for values in (self.T_world_object, self.table, self.entropy)):
+            raise ValueError(f"{self.name}: a number is not finite")
+        if np.isnan(self.errors).any() or n == 0:
+            raise ValueError(f"{self.name}: errors must not be NaN, and there must be an object")
+
+
+def observe_scene(
+    name: str,
+    T_world_object: np.ndarray,
+    capture: Callable[[np.ndarray, int], View],
+    estimator: Estimator,
+    verifier: Verifier,
+    model: ObjectModel,
+    sphere: ViewSphere,
+    grid: SurfaceGrid,
+) -> BankScene:
+    """Look at a scene from every view of the grid.
+
+    Args:
+        name: of the scene.
+        T_world_object: (n, 4, 4) true poses.
+        capture: ``T_world_camera`` and a stamp in nanoseconds to the view there.
+        estimator: the deployed one.
+        verifier: the deployed one.
+        model: the object.
+        sphere: the views.
+        grid: of the surface.
+    """
+    views, tables, entropy, surface = [], [], [], []
+    for index, position in enumerate(sphere.positions):
+        view = capture(sphere.pose(position), (index + 1) * 1_000_000_000)
+        hypotheses = estimator.estimate(view)
+        verification = verifier.score(view.depth, view.camera, hypotheses)
+        T = hypotheses.T_camera_object
+        rows = [
+            T[:, :3, 3],
+            quaternion_from_transform(T),
+            verification,
+            hypotheses.score,
+            hypotheses.box,
+            hypotheses.depth,
+        ]
+        tables.append(np.column_stack(rows).astype(np.float32))
+        views.append(np.full(len(hypotheses), index))
+        entropy.append(view_entropy(hypotheses.segmentation))
+        surface.append(np.packbits(grid.observe(view.depth, view.camera, view.T_world_camera)))
+    view, table = np.concatenate(views), np.concatenate(tables)
+    errors = e_add(model, world_poses(table, view, sphere)[:, None], T_world_object[None], cutoff=MISSED_E_ADD)
+    errors[errors >= MISSED_E_ADD] = np.inf
+    return BankScene(name, T_world_object, view, table, errors.astype(np.float32), np.array(entropy), np.stack(surface))
+
+
+def view_entropy(segmentation: np.ndarray) -> float:
+    """Shannon entropy in nats of the relative areas of the predicted masks, the background among them.
+
+    Vazquez's viewpoint entropy, as in the entropy-based baseline's source.
+
+    Args:
+        segmentation: (H, W) label per pixel.
+    """
+    areas = np.unique(segmentation, return_counts=True)[1] / segmentation.size
+    return float(-(areas * np.log(areas)).sum())
+
+
+def build_bank(
+    path: Path,
+    object_name: str,
+    scenes: Sequence[str],
+    observe: Callable[[str], BankScene],
+    *,
+    workers: int = 1,
+    provenance: dict | None = None,
+    sphere: ViewSphere | None = None,
+    grid: SurfaceGrid | None = None,
+) -> Iterator[str]:
+    """Observe all scenes and write the bank; yields each scene's name as it is done.
+
+    Finished scenes are kept beside ``path`` until the bank is complete, so a run that was interrupted goes on where it
+    stopped, and a bank that is there is only extended; what was made with another ``provenance`` is made again.
+
+    Args:
+        path: of the ``.npz`` to write.
+        object_name: of the object.
+        scenes: their names, in the bank's order.
+        observe: name to what was seen; it must be picklable (a module's function, or a ``functools.partial`` of one).
+        workers: processes.
+        provenance: what the bank depends on and remembers: estimator, its parameters, noise, versions; JSON values.
+        sphere: grid of the views, the default one when None.
+        grid: of the surface, the object's usual one when None.
+    """
+    grid = grid or SurfaceGrid.for_model(load_object(object_name))
+    empty = SceneBank(object_name, sphere or ViewSphere(), grid, [], provenance or {})
+    known = _scenes_of(path, empty)
+    parts = path.with_suffix(".parts")
+    parts.mkdir(parents=True, exist_ok=True)
+    files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes if name not in known}
+    missing = [name for name, file in files.items() if not _scenes_of(file, empty)]
+    yield from (name for name in scenes if name not in missing)
+    # Spawned, because a forked child inherits locks of threads that do not live on in it (Embree, BLAS).
+    pool = ProcessPoolExecutor(max(1, min(workers, len(missing))), mp_context=multiprocessing.get_context("spawn"))
+    try:
+        running = {pool.submit(_observe_to_file, observe, name, files[name], empty): name for name in missing}
+        for done in as_completed(running):
+            done.result()
+            yield running[done]
+    finally:
+        pool.shutdown(cancel_futures=True)
+    made = known | {name: load_bank(file).scenes[0] for name, file in files.items()}
+    replace(empty, scenes=[made[name] for name in scenes]).save(path)
+    for file in files.values():
+        file.unlink()
+    if not any(parts.iterdir()):
+        parts.rmdir()
+
+
+def _scenes_of(path: Path, like: "SceneBank") -> dict[str, BankScene]:
+    """The scenes of a bank that is whole and was made the same way as ``like``, by name; none otherwise."""
+    try:
+        bank = load_bank(path)
+    except ValueError:
+        return {}
+    made = bank.provenance, bank.sphere, bank.grid
+    same = made == (json.loads(json.dumps(like.provenance)), like.sphere, like.grid)
+    return {scene.name: scene for scene in bank.scenes} if same else {}
+
+
+def _observe_to_file(observe: Callable[[str], BankScene], name: str, path: Path, bank: "SceneBank") -> None:
+    replace(bank, scenes=[observe(name)]).save(path)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBank:
+    """All scenes of one object and split.
+
+    Attributes:
+        object_name: of the object.
+        sphere: grid of the views.
+        grid: of the surface.
+        scenes: in order.
+        provenance: how the bank was made.
+
+    Raises:
+        ValueError: a scene's surface is not of this grid and these views.
+    """
+
+    object_name: str
+    sphere: ViewSphere
+    grid: SurfaceGrid
+    scenes: Sequence[BankScene]
+    provenance: dict
+
+    def __post_init__(self) -> None:
+        expected = len(self.sphere), -(-len(self.grid) // 8)
+        for scene in self.scenes:
+            if scene.surface.shape != expected or scene.surface.dtype != np.uint8:
+                raise ValueError(f"{scene.name}: surface has shape {scene.surface.shape}, expected {expected} bytes")
+
+    @cached_property
+    def model(self) -> ObjectModel:
+        """The object."""
+        return load_object(self.object_name)
+
+    def save(self, path: Path) -> None:
+        """Write one compressed ``.npz``; it appears under its name only when it is complete."""
+        header = {
+            "format": FORMAT,
+            "object": self.object_name,
+            "scenes": [scene.name for scene in self.scenes],
+            "radius": self.sphere.radius,
+            "elevations_degrees": list(self.sphere.elevations_degrees),
+            "azimuths": self.sphere.azimuths,
+            "surface": asdict(self.grid),
+            "provenance": self.provenance,
+        }
+        pairs = [np.nonzero(np.isfinite(scene.errors)) for scene in self.scenes]
+        unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
+        with unfinished.open("wb") as file:
+            np.savez_compressed(
+                file,
+                header=json.dumps(header),
+                object_count=[len(scene.T_world_object) for scene in self.scenes],
+                T_world_object=np.concatenate([scene.T_world_object for scene in self.scenes]),
+                hypothesis_count=[np.bincount(s.view, minlength=len(self.sphere)) for s in self.scenes],
+                table=np.concatenate([scene.table for scene in self.scenes]),
+                pair_count=[len(rows) for rows, _ in pairs],
+                pair_hypothesis=np.concatenate([rows for rows, _ in pairs]).astype(np.int32),
+                pair_object=np.concatenate([columns for _, columns in pairs]).astype(np.int16),
+                pair_error=np.concatenate([s.errors[pair] for s, pair in zip(self.scenes, pairs, strict=True)]),
+                entropy=[scene.entropy for scene in self.scenes],
+                # View by view for each cell: a cell is mostly seen from many neighbouring views or from none, which
+                # compresses to a fraction of what cell by cell for each view does.
+                surface=[_transpose_bits(scene.surface, len(self.grid)) for scene in self.scenes],
+            )
+        unfinished.replace(path)
+
+
+def cached_banks() -> Path:
+    """Folder that banks are made in unless another is asked for."""
+    return cache_folder("banks")
+
+
+def bank_path(folder: Path, object_name: str, split: str, seed: int = 0) -> Path:
+    """Where the bank of an object and split lies in a folder of banks; one of another seed of the noise lies beside."""
+    return folder / f"{object_name}_{split}{f'_seed{seed}' if seed else ''}.npz"
+
+
+def find_bank(object_name: str, split: str, folder: Path | None = None, seed: int = 0) -> Path:
+    """The bank of an object, split and seed in ``folder``; without one, in the cache or else among the shipped ones.
+
+    Raises:
+        ValueError: there is none; the message says what makes it.
+    """
+    folders = (cached_banks(), SHIPPED_BANKS) if folder is None else (folder,)
+    for path in (bank_path(each, object_name, split, seed) for each in folders):
+        if path.is_file():
+            return path
+    options = (f" --seed {seed}" if seed else "") + ("" if folder is None else f" --banks {folder}")
+    raise ValueError(
+        f"there is no {split} bank of '{object_name}'{f' with seed {seed}' if seed else ''} in {folders[0]}; "
+        f"make it with: active6d bank --object {object_name} --split {split}{options}"
+    )
+
+
+def load_bank(path: Path) -> SceneBank:
+    """Read a file that :meth:`SceneBank.save` wrote.
+
+    Raises:
+        ValueError: the file is missing, damaged, of another format or not a bank; the message names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            data = dict(stored)
+        header = json.loads(str(data["header"]))
+        if header["format"] != FORMAT:
+            raise ValueError(f"format {header['format']}, this version reads {FORMAT}")
+        sphere = ViewSphere(header["radius"], tuple(header["elevations_degrees"]), header["azimuths"])
+        surface = header["surface"]
+        grid = SurfaceGrid(**{**surface, "width": tuple(surface["width"])})
+        scenes = [_read_scene(data, index, name) for index, name in enumerate(header["scenes"])]
+        return SceneBank(header["object"], sphere, grid, scenes, header["provenance"])
+    except Exception as error:  # numpy raises many kinds on damaged archives
+        raise ValueError(f"{path}: not a scene bank ({error}); make it anew with 'active6d bank'") from error
+
+
+def _read_scene(data: dict[str, np.ndarray], index: int, name: str) -> BankScene:
+    """Cut one scene out of the concatenated tables."""
+
+    def part(counts: np.ndarray) -> slice:
+        end = int(counts[: index + 1].sum())
+        return slice(end - int(counts[index]), end)
+
+    per_view = data["hypothesis_count"]
+    rows, objects = part(per_view.sum(axis=1)), part(data["object_count"])
+    pairs = part(data["pair_count"])
+    errors = np.full((rows.stop - rows.start, objects.stop - objects.start), np.inf, np.float32)
+    errors[data["pair_hypothesis"][pairs], data["pair_object"][pairs]] = data["pair_error"][pairs]
+    view = np.repeat(np.arange(per_view.shape[1]), per_view[index])
+    return BankScene(
+        name,
+        data["T_world_object"][objects],
+        view,
+        data["table"][rows],
+        errors,
+        data["entropy"][index],
+        _transpose_bits(data["surface"][index], per_view.shape[1]),
+    )
+
+
+def _transpose_bits(packed: np.ndarray, count: int) -> np.ndarray:
+    """(a, ceil(count / 8)) uint8, rows of packed bits, to (count, ceil(a / 8))."""
+    return np.packbits(np.unpackbits(packed, axis=1, count=count).T, axis=1)
+
+
+def world_poses(table: np.ndarray, view: np.ndarray, sphere: ViewSphere) -> np.ndarray:
+    """(H, 4, 4) ``T_world_object`` of the hypotheses in a :class:`BankScene`'s table."""
+    T_world_camera = np.stack([sphere.pose(position) for position in sphere.positions])
+    rows = table.astype(float)
+    return T_world_camera[view] @ transform_from_quaternion(rows[:, 3:7], rows[:, :3])

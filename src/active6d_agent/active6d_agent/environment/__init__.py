@@ -1,0 +1,1 @@
+"""The paper's decision process as a Gymnasium environment, and its speed."""

@@ -1,0 +1,1 @@
+"""Policies and bounds from the same starts: scores, intervals, oracles and ablations."""

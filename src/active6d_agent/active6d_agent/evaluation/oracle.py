@@ -1,0 +1,65 @@
+"""Bounds that see the truth: how much of what could be won a policy has won."""
+
+import numpy as np
+
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_core.metrics import DETECTION_FRACTION, MISSED_E_ADD
+
+# Candidates scored in one call: enough to be fast, few enough to stay in memory.
+_CHUNK = 4096
+
+
+def known(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """(E, o, 2) what is known of every true object after (E, v) views, -1 padding: 1 when it is detected, and
+    1 - e_ADD / 50 mm; zeros beyond a scene's own objects."""
+    parts = []
+    for start in range(0, len(scene), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        errors = lookup.object_errors(lookup.fuse(scene[part], views[part], views[part, -1]))
+        real = np.arange(errors.shape[1]) < lookup.object_count[scene[part]][:, None]
+        detected = errors < DETECTION_FRACTION * lookup.model.diameter
+        parts.append(np.stack([real & detected, real * (1.0 - errors / MISSED_E_ADD)], axis=-1))
+    return np.concatenate(parts)
+
+
+def tally(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """(E, 2) the sums of :func:`known` over the objects."""
+    return known(lookup, scene, views).sum(axis=1)
+
+
+def worth(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """(E,) number of objects detected after (E, v) views, plus less than one for a small mean error."""
+    detected, closeness = tally(lookup, scene, views).T
+    return detected + 0.999 * closeness / lookup.object_count[scene]
+
+
+def search_views(
+    lookup: BatchedFusion, scene: int, start: int, steps: int, *, width: int = 1, allowed: np.ndarray | None = None
+) -> np.ndarray:
+    """The best views that a search with the truth at hand finds: greedy, or with a beam.
+
+    Args:
+        lookup: of the bank.
+        scene: index of the scene.
+        start: first view.
+        steps: moves T.
+        width: of the beam; 1 is the greedy oracle.
+        allowed: (M,) bool, views in reach, all when None.
+
+    Returns:
+        (T + 1,) views in the order in which they were chosen, fewer where no view is left.
+    """
+    allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
+    beam = np.array([[start]])
+    for _ in range(steps):
+        free = np.tile(allowed, (len(beam), 1))
+        free[np.arange(len(beam))[:, None], beam] = False
+        parent, view = np.nonzero(free)
+        if not len(view):
+            break
+        paths = np.column_stack([beam[parent], view])
+        # The same set of views in another order is the same.
+        paths = paths[np.unique(np.sort(paths, axis=1), axis=0, return_index=True)[1]]
+        value = worth(lookup, np.full(len(paths), scene), paths)
+        beam = paths[np.argsort(-value, kind="stable")[:width]]
+    return beam[0]

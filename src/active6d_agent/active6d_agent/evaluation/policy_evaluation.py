@@ -1,0 +1,313 @@
+"""The paper's Table 1 on a bank: every policy from the same starts, with paired intervals and bounds beside them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.evaluation.oracle import search_views
+from active6d_agent.policies.registry import Observation, Policy, create_policy
+
+BOUNDS = ("oracle", "all-views")
+MEASURES = ("detection_rate", "e_add_mm", "distance_m")
+_RESAMPLES = 2000
+# Episodes between two reports of progress.
+_TOGETHER = 100
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeResults:
+    """What E episodes of one policy ended with.
+
+    Attributes:
+        scene: (E,) indices.
+        detection_rate: (E,) fraction of the objects.
+        e_add_mm: (E,) mean over the objects, 50 mm for the missed.
+        distance_m: (E,) along the hemisphere.
+        views: (E, T + 1) views taken, -1 after an early stop.
+    """
+
+    scene: np.ndarray
+    detection_rate: np.ndarray
+    e_add_mm: np.ndarray
+    distance_m: np.ndarray
+    views: np.ndarray
+
+    @property
+    def measures(self) -> dict[str, np.ndarray]:
+        """The paper's three measures by name, (E,) each."""
+        return {name: getattr(self, name) for name in MEASURES}
+
+
+def all_starts(lookup: BatchedFusion, sample: int | None = None, seed: int = 0) -> np.ndarray:
+    """(E, 2) scenes and first views: every pair, or ``sample`` of them drawn without replacement."""
+    scenes, views = len(lookup.bank.scenes), len(lookup.sphere)
+    pairs = np.stack(np.unravel_index(np.arange(scenes * views), (scenes, views)), axis=1)
+    if sample is None or sample >= len(pairs):
+        return pairs
+    return pairs[np.sort(np.random.default_rng(seed).choice(len(pairs), sample, replace=False))]
+
+
+def run_policy(
+    lookup: BatchedFusion,
+    make_policy: Callable[[int], Policy],
+    starts: np.ndarray,
+    steps: int,
+    *,
+    seed: int = 0,
+    allowed: np.ndarray | None = None,
+    metres: float = np.inf,
+) -> EpisodeResults:
+    """Run a policy from every start, all episodes side by side.
+
+    Args:
+        lookup: of the bank.
+        make_policy: index of a scene to the policy for it.
+        starts: (E, 2) scenes and first views.
+        steps: moves T.
+        seed: each episode's randomness follows from it and its start.
+        allowed: (M,) bool, views in reach, all when None.
+        metres: budget of each episode.
+    """
+    scene = starts[:, 0]
+    views = np.full((len(starts), steps + 1), -1)
+    views[:, 0] = starts[:, 1]
+    policies = [make_policy(index) for index in scene]
+    for policy, start in zip(policies, starts.tolist(), strict=True):
+        policy.reset(np.random.default_rng([seed, *start]))
+    running = np.arange(len(starts))
+    for step in range(steps):
+        if not len(running):
+            break
+        left = np.full(len(running), steps - step)
+        observations = observe(lookup, scene[running], views[running], left, allowed=allowed, metres=metres)
+        for episode, observation in zip(running, observations, strict=True):
+            decision = policies[episode].decide(observation)
+            views[episode, step + 1] = -1 if decision.stop else decision.view
+        running = running[views[running, step + 1] >= 0]
+    return measure(lookup, scene, views)
+
+
+def observe(
+    lookup: BatchedFusion,
+    scene: np.ndarray,
+    views: np.ndarray,
+    left: np.ndarray,
+    *,
+    allowed: np.ndarray | None = None,
+    metres: float = np.inf,
+) -> list[Observation]:
+    """What a policy sees after (E, v) views, -1 padding at the end, with (E,) moves left.
+
+    Args:
+        lookup: of the bank.
+        scene: (E,) indices.
+        views: taken so far, at least one.
+        left: of the budget.
+        allowed: (M,) bool, views in reach, all when None.
+        metres: budget of each episode from its beginning.
+    """
+    allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
+    count = (views >= 0).sum(axis=1)
+    current = views[np.arange(len(views)), count - 1]
+    fused = lookup.fuse(scene, views, current)
+    described = zip(lookup.describe(fused, scene, current), lookup.unexplained(fused, scene, views), strict=True)
+    observations = []
+    for (objects, unexplained), taken, number, moves in zip(described, views, count, left, strict=True):
+        positions = lookup.sphere.positions[taken[:number]]
+        metres_left = metres - lookup.sphere.path_length(positions)
+        observation = Observation(
+            objects, positions, lookup.sphere, allowed, int(moves), metres_left, unexplained=unexplained
+        )
+        observations.append(observation)
+    return observations
+
+
+def measure(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
+    """Score (E, v) views, -1 padding, taken in order."""
+    last = np.take_along_axis(views, (views >= 0).sum(axis=1, keepdims=True) - 1, axis=1)[:, 0]
+    scores = lookup.evaluate(lookup.fuse(scene, views, last), scene)
+    positions = lookup.sphere.positions[views]
+    arcs = np.where(views[:, 1:] >= 0, lookup.sphere.arc(positions[:, :-1], positions[:, 1:]), 0.0)
+    return EpisodeResults(
+        scene=scene,
+        detection_rate=np.array([score.detection_rate for score in scores]),
+        e_add_mm=np.array([score.mean_e_add_mm for score in scores]),
+        distance_m=arcs.sum(axis=1),
+        views=views,
+    )
+
+
+def run_named(
+    lookup: BatchedFusion, name: str, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict | None = None
+) -> EpisodeResults:
+    """Run a policy or a bound by name.
+
+    Args:
+        lookup: of the bank.
+        name: of a policy, or one of ``BOUNDS``: ``oracle`` is greedy with the truth at hand, ``all-views`` takes all.
+        starts: (E, 2) scenes and first views.
+        steps: moves T.
+        seed: of the policy's randomness.
+        parameters: of the policy.
+
+    Raises:
+        ValueError: no such policy.
+    """
+    scene = starts[:, 0]
+    if name == "oracle":
+        found = [search_views(lookup, int(index), int(view), steps) for index, view in starts]
+        return measure(lookup, scene, np.stack(found))
+    if name == "all-views":
+        return _all_views(lookup, starts)
+
+    def make(index: int) -> Policy:
+        own = {"entropy": lookup.bank.scenes[index].entropy} if name == "entropy" else {}
+        return create_policy(name, lookup.model, **{**own, **(parameters or {})})
+
+    return run_policy(lookup, make, starts, steps, seed=seed)
+
+
+def _all_views(lookup: BatchedFusion, starts: np.ndarray) -> EpisodeResults:
+    """Every view of the grid in its order from the first on; each scene is fused once, since order changes nothing."""
+    grid = np.arange(len(lookup.sphere))
+    scenes, inverse = np.unique(starts[:, 0], return_inverse=True)
+    once = measure(lookup, scenes, np.tile(grid, (len(scenes), 1)))
+    views = (grid + starts[:, 1:]) % len(grid)
+    steps = lookup.sphere.positions[views]
+    metres = lookup.sphere.arc(steps[:, :-1], steps[:, 1:]).sum(axis=1)
+    return EpisodeResults(starts[:, 0], once.detection_rate[inverse], once.e_add_mm[inverse], metres, views)
+
+
+class Intervals:
+    """95 % bootstrap intervals of means over E episodes, by resampling in two ways.
+
+    ``ci95`` draws episodes: what other starts in these very scenes could have given. ``ci95_scenes`` draws whole scenes
+    with all their starts (a cluster bootstrap): what other scenes could have given. The starts of a scene look at the
+    same heap, so they are not independent and say less together than their number suggests; a claim about scenes not
+    seen needs the second interval, which is the wider one. Ten scenes are few for it: expect it to be a tenth or so too
+    narrow still.
+
+    Of two policies from the same starts, give the differences: that pairs them.
+
+    Args:
+        scene: (E,) indices of the episodes' scenes.
+        seed: of the resampling.
+        resamples: drawn of each kind.
+    """
+
+    def __init__(self, scene: np.ndarray, seed: int = 0, resamples: int = _RESAMPLES) -> None:
+        clusters = {"ci95": np.arange(len(scene)), "ci95_scenes": np.unique(scene, return_inverse=True)[1]}
+        self._weights = {}
+        for kind, cluster in clusters.items():
+            count = cluster.max() + 1
+            rng = np.random.default_rng(seed)
+            weight = rng.multinomial(count, np.full(count, 1.0 / count), size=resamples)[:, cluster]
+            self._weights[kind] = weight / weight.sum(axis=1, keepdims=True)
+
+    def of(self, values: np.ndarray) -> dict[str, list[float]]:
+        """Both intervals of the mean of (E,) values, by name."""
+        return {kind: np.quantile(weight @ values, [0.025, 0.975]).tolist() for kind, weight in self._weights.items()}
+
+    def of_ratio(self, part: np.ndarray, whole: np.ndarray) -> dict[str, list[float]]:
+        """Both intervals of the mean of (E,) ``part`` over that of (E,) ``whole``, of which some must be positive;
+        resamples without any are left out."""
+        table = {}
+        for kind, weight in self._weights.items():
+            wholes = weight @ whole
+            some = wholes > 0
+            table[kind] = np.quantile((weight @ part)[some] / wholes[some], [0.025, 0.975]).tolist()
+        return table
+
+
+def evaluate(
+    lookup: BatchedFusion,
+    names: Sequence[str],
+    steps: int,
+    starts: np.ndarray,
+    *,
+    seed: int = 0,
+    parameters: dict[str, dict] | None = None,
+    on_progress: Callable[[str, int], None] = lambda name, episodes: None,
+) -> Iterator[tuple[str, EpisodeResults]]:
+    """Run every policy from the same starts; yields each as it is done.
+
+    Args:
+        lookup: of the bank.
+        names: of policies and bounds.
+        steps: moves T.
+        starts: (E, 2) scenes and first views.
+        seed: of the policies' randomness.
+        parameters: name to parameters.
+        on_progress: called with the name and how many more of its episodes are done.
+    """
+    for name in names:
+        parts = []
+        for some in np.array_split(starts, -(-len(starts) // _TOGETHER)):
+            parts.append(run_named(lookup, name, some, steps, seed=seed, parameters=(parameters or {}).get(name)))
+            on_progress(name, len(some))
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        yield name, EpisodeResults(*map(np.concatenate, columns))
+
+
+def describe(measures: dict[str, np.ndarray], intervals: Intervals, first: dict[str, np.ndarray] | None = None) -> dict:
+    """The mean of each measure (E,) as ``name``, with ``name_ci95`` and ``name_ci95_scenes`` (:class:`Intervals`); and
+    ``against_first``, the paired differences to other measures (:func:`compare`), where those are given."""
+    row: dict = {}
+    for name, values in measures.items():
+        row[name] = float(values.mean())
+        row |= {f"{name}_{kind}": interval for kind, interval in intervals.of(values).items()}
+    return row if first is None else {**row, "against_first": compare(measures, first, intervals)}
+
+
+def compare(own: dict[str, np.ndarray], other: dict[str, np.ndarray], intervals: Intervals) -> dict[str, dict]:
+    """Paired differences of each measure (E,), positive where ``own`` is higher: ``mean``, both intervals, and whether
+    these exclude zero (``excludes_zero``, ``excludes_zero_scenes``)."""
+    table = {}
+    for name, values in own.items():
+        difference = values - other[name]
+        both = intervals.of(difference)
+        sure = {f"excludes_zero{kind.removeprefix('ci95')}": low > 0 or high < 0 for kind, (low, high) in both.items()}
+        table[name] = {"mean": float(difference.mean()), **both, **sure}
+    return table
+
+
+def summarise(results: dict[str, EpisodeResults], object_name: str, steps: int, seed: int = 0) -> dict:
+    """The table: means with 95 % intervals, paired differences to every other policy, and the share of the gap closed.
+
+    Args:
+        results: of every policy, all from the same starts.
+        object_name: of the object.
+        steps: moves T.
+        seed: of the resampling.
+
+    Returns:
+        ``{"object", "steps", "episodes", "scenes", "policies": {name: {...}}}``; a policy's row is that of
+        :func:`describe`, with ``gap_closed``, None unless ``random`` and ``oracle`` are among the results, and
+        ``against``: every other policy's name to :func:`compare`.
+    """
+    scene = next(iter(results.values())).scene
+    intervals = Intervals(scene, seed)
+    table = {}
+    for name, own in results.items():
+        against = {
+            other: compare(own.measures, theirs.measures, intervals)
+            for other, theirs in results.items()
+            if other != name
+        }
+        table[name] = {
+            **describe(own.measures, intervals),
+            "gap_closed": _gap_closed(results, own),
+            "against": against,
+        }
+    scenes = len(np.unique(scene))
+    return {"object": object_name, "steps": steps, "episodes": len(scene), "scenes": scenes, "policies": table}
+
+
+def _gap_closed(results: dict[str, EpisodeResults], own: EpisodeResults) -> float | None:
+    """Share of the way from Random's detection rate to the greedy oracle's."""
+    if not {"random", "oracle"} <= results.keys():
+        return None
+    low, high = (results[name].detection_rate.mean() for name in ("random", "oracle"))
+    return float((own.detection_rate.mean() - low) / (high - low)) if high > low else None

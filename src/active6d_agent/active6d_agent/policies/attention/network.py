@@ -1,0 +1,172 @@
+"""The paper's policy: object attention (Algorithm 1) and a Gaussian over azimuth and elevation.
+
+Registered as ``attention``. :mod:`active6d_agent.policies.attention.ppo` trains it and writes a ``.safetensors`` file
+with a JSON file of the configuration beside it; loading them executes no code.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from active6d_agent.environment.gym_environment import MAX_OBJECTS
+from active6d_agent.policies.policy_weights import load_weights, save_weights
+from active6d_agent.policies.registry import Decision, Observation, register_policy, weights_path
+from active6d_core.object_model import ObjectModel
+
+#: What a state consists of beside the history: o_t (12) and the camera's position (3).
+_STATE = 15
+_FEATURES = 6
+#: How the attended object is chosen.
+ATTENTION_RULES = ("learned", "lowest-score")
+
+
+class ObjectAttention(nn.Module):
+    """Algorithm 1: which object to reason about.
+
+    g^i = FC(b^i, d^i, c^i); w^i = Selector(g^i, mean g); the object with the highest softmax weight m is attended, and
+    o_t = (g^m times its weight, b^m, d^m, c^m). The choice is hard; gradients reach FC and Selector through g^m and
+    through the weight.
+
+    Args:
+        rule: "learned"; or "lowest-score" for the ablation, where the object with the lowest verification score is
+            attended and has all the weight.
+
+    Raises:
+        ValueError: no such rule.
+    """
+
+    def __init__(self, rule: str = "learned") -> None:
+        super().__init__()
+        if rule not in ATTENTION_RULES:
+            raise ValueError(f"attention: no rule '{rule}', there are {', '.join(ATTENTION_RULES)}")
+        self.rule = rule
+        self.fc = nn.Sequential(nn.Linear(_FEATURES, _FEATURES), nn.ReLU())
+        self.selector = nn.Linear(2 * _FEATURES, 1)
+
+    def forward(self, objects: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Attend to one object of each scene.
+
+        Args:
+            objects: (B, N, 6) features, padded.
+            mask: (B, N) 1 for an object, 0 for padding.
+
+        Returns:
+            (B, 12) o_t, zeros without objects; (B, N) weights, zero for padding; (B,) index m, N - 1 without objects.
+        """
+        present = mask > 0
+        g = self.fc(objects)
+        count = present.sum(dim=1, keepdim=True).clamp(min=1)
+        pooled = (g * present[..., None]).sum(dim=1) / count
+        together = torch.cat([g, pooled[:, None].expand_as(g)], dim=-1)
+        score = self.selector(together)[..., 0].masked_fill(~present, -1e9)
+        weight = torch.softmax(score, dim=1) * present
+        if self.rule == "lowest-score":
+            lowest = objects[..., -1].masked_fill(~present, torch.inf).argmin(dim=1)
+            weight = nn.functional.one_hot(lowest, objects.shape[1]).to(objects.dtype) * present
+        index = weight.argmax(dim=1)
+        rows = torch.arange(len(objects), device=objects.device)
+        some = present.any(dim=1)
+        attended = torch.cat([g[rows, index] * weight[rows, index, None], objects[rows, index]], dim=1)
+        last = torch.full_like(index, objects.shape[1] - 1)
+        return attended * some[:, None], weight, torch.where(some, index, last)
+
+
+class AttentionNetwork(nn.Module):
+    """State (o_t, camera, history) to the mean of the Gaussian: one hidden layer of 128 units (supplement, E).
+
+    Args:
+        steps: horizon T that the history has room for.
+        hidden: units of the hidden layer.
+        rule: of :class:`ObjectAttention`.
+    """
+
+    def __init__(self, steps: int = 5, hidden: int = 128, rule: str = "learned") -> None:
+        super().__init__()
+        self.steps, self.hidden = steps, hidden
+        self.attention = ObjectAttention(rule)
+        self.policy = nn.Sequential(nn.Linear(_STATE + 3 * steps, hidden), nn.ReLU())
+        self.mean = nn.Linear(hidden, 2)
+        self.log_std = nn.Parameter(torch.full((2,), -0.5))
+
+    def state(self, observation: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(B, 15 + 3 T) state s_t, (B, N) attention weights and (B,) attended index."""
+        attended, weight, index = self.attention(observation["objects"], observation["mask"])
+        state = torch.cat([attended, observation["camera"], observation["history"].flatten(1)], dim=1)
+        return state, weight, index
+
+    def forward(self, observation: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """(B, 2) mean azimuth and elevation in [-1, 1] units, attention weights, attended index."""
+        state, weight, index = self.state(observation)
+        return self.mean(self.policy(state)), weight, index
+
+
+def save_network(network: AttentionNetwork, path: Path, provenance: dict | None = None) -> None:
+    """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
+    config = {"steps": network.steps, "hidden": network.hidden, "rule": network.attention.rule}
+    save_weights(network, path, "attention", config, provenance)
+
+
+def load_network(path: Path) -> AttentionNetwork:
+    """Read what :func:`save_network` wrote.
+
+    Raises:
+        ValueError: a file is missing, damaged or does not fit; the message names it.
+    """
+    return load_weights(
+        path, "attention", lambda config: AttentionNetwork(config["steps"], config["hidden"], config["rule"])
+    )
+
+
+@register_policy("attention")
+class AttentionPolicy:
+    """The trained network, always at the mean of its Gaussian.
+
+    Args:
+        model: names the shipped weights.
+        weights: path of other weights, ``""`` for the shipped ones.
+
+    Raises:
+        ValueError: there are no usable weights.
+    """
+
+    def __init__(self, model: ObjectModel, weights: str = "") -> None:
+        self.network = load_network(Path(weights) if weights else weights_path("attention", model.name))
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """The mean is taken, so nothing is random here."""
+
+    def decide(self, observation: Observation) -> Decision:
+        """Attend to one object and go to the candidate nearest to the mean."""
+        candidates = observation.candidates()
+        if not candidates.any():
+            return Decision.stop_here(observation)
+        with torch.inference_mode():
+            mean, weight, index = self.network(encode(observation, self.network.steps))
+        count = min(len(observation.objects), MAX_OBJECTS)
+        attention = np.zeros(len(observation.objects))
+        attention[:count] = weight[0, :count].double().numpy()
+        azimuth, elevation = mean[0].double().clamp(-1.0, 1.0).tolist()
+        goal = observation.sphere.position(np.pi * azimuth, np.pi / 4 * (elevation + 1.0))
+        closeness = np.where(candidates, observation.sphere.positions @ goal, -np.inf)
+        attended = int(index[0]) if count else None
+        return Decision.go_to(observation, int(closeness.argmax()), attention / max(attention.sum(), 1e-12), attended)
+
+
+def encode(observation: Observation, steps: int) -> dict[str, torch.Tensor]:
+    """One observation as a batch of one, equal to :meth:`~active6d_agent.environment.gym_environment.Episodes.observe`.
+
+    Args:
+        observation: of the policy.
+        steps: horizon T of the network; of a longer history the last T positions are kept.
+    """
+    unit = observation.positions / observation.sphere.radius
+    features = observation.objects.features()[:MAX_OBJECTS]
+    objects, mask = np.zeros((1, MAX_OBJECTS, _FEATURES), np.float32), np.zeros((1, MAX_OBJECTS), np.float32)
+    history = np.zeros((1, steps, 3), np.float32)
+    objects[0, : len(features)], mask[0, : len(features)] = features, 1.0
+    past = unit[:-1][-steps:]
+    history[0, : len(past)] = past
+    arrays = {"objects": objects, "mask": mask, "camera": unit[-1:].astype(np.float32), "history": history}
+    return {name: torch.from_numpy(values) for name, values in arrays.items()}

@@ -1,0 +1,326 @@
+"""Training the paper's policy with PPO ("Policy learning", supplement E): Stable-Baselines3 on a scene bank."""
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from safetensors.torch import load_file, save_file
+from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
+
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.gym_environment import Active6DVectorEnv, Episodes, RewardParameters
+from active6d_agent.policies.attention.network import ATTENTION_RULES, AttentionNetwork, ObjectAttention, save_network
+
+
+@dataclass(frozen=True)
+class PpoParameters:
+    """How to train; the paper's hyper-parameters where it gives them.
+
+    Attributes:
+        steps: horizon T.
+        total: environment steps (the paper: 1e7).
+        environments: episodes side by side.
+        rollout: steps of each environment between updates, a multiple of ``steps``.
+        gamma: discount (paper).
+        learning_rate: of Adam; the paper's 1e-4 goes with its 1e7 steps.
+        batch: minibatch (paper: "number of batches 128").
+        epochs: passes over each rollout.
+        entropy: weight of the entropy bonus.
+        seed: of everything.
+        evaluate_every: environment steps between evaluations on the validation scenes.
+        attend: which object, see :class:`~active6d_agent.policies.attention.network.ObjectAttention`.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+
+    steps: int = 5
+    total: int = 1_000_000
+    environments: int = 128
+    rollout: int = 20
+    gamma: float = 0.995
+    learning_rate: float = 5e-4
+    batch: int = 128
+    epochs: int = 4
+    entropy: float = 0.0
+    seed: int = 0
+    evaluate_every: int = 50_000
+    attend: str = "learned"
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "total", "environments", "rollout", "batch", "epochs", "evaluate_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
+        if self.rollout % self.steps:
+            raise ValueError(f"training: rollout {self.rollout} must be a multiple of steps {self.steps}")
+        if self.attend not in ATTENTION_RULES:
+            raise ValueError(f"training: attend must be one of {', '.join(ATTENTION_RULES)}, got {self.attend}")
+
+
+class BankVecEnv(VecEnv):
+    """:class:`Active6DVectorEnv` as Stable-Baselines3 wants it."""
+
+    def __init__(self, environment: Active6DVectorEnv) -> None:
+        self.environment = environment
+        self._actions = np.zeros((environment.num_envs, 3))
+        self._returns = np.zeros(environment.num_envs)
+        self.render_mode = None
+        super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
+
+    def reset(self) -> dict[str, np.ndarray]:
+        """Begin all episodes; the first time with the seed given to :meth:`seed`."""
+        seed, self._seeds[0] = self._seeds[0], None
+        return self.environment.reset(seed=seed)[0]
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Remember the actions."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict]]:
+        """Move all cameras."""
+        observation, reward, done, _, info = self.environment.step(self._actions)
+        self._returns += reward
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for index in np.flatnonzero(done):
+            last = {name: values[index] for name, values in info["final_obs"].items()}
+            episode = {"r": self._returns[index], "l": self.environment.episodes.steps, "t": 0.0}
+            infos[index] = {"terminal_observation": last, "episode": episode}
+        self._returns[done] = 0.0
+        return observation, reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute, which all episodes share."""
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute, which all episodes share."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """There are no single environments to call.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(f"episodes side by side have no method {method_name} of their own")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """No wrappers."""
+        return [False] * len(list(self._get_indices(indices)))
+
+
+class AttentionExtractor(BaseFeaturesExtractor):
+    """The state s_t; remembers the index that the attention chose last, which is part of the action."""
+
+    def __init__(self, observation_space: spaces.Dict, rule: str = "learned") -> None:
+        self.steps = observation_space["history"].shape[0]
+        super().__init__(observation_space, 15 + 3 * self.steps)
+        self.attention = ObjectAttention(rule)
+        self.attended = torch.zeros(0, dtype=torch.long)
+
+    def forward(self, observation: dict[str, torch.Tensor]) -> torch.Tensor:
+        """(B, 15 + 3 T)."""
+        attended, _, self.attended = self.attention(observation["objects"], observation["mask"])
+        return torch.cat([attended, observation["camera"], observation["history"].flatten(1)], dim=1)
+
+
+class PaperPolicy(ActorCriticPolicy):
+    """128 ReLU units, a Gaussian over the two angles; the third component of an action is the attended index.
+
+    The index follows from the state, so it has no probability of its own: the attention learns through o_t, whose
+    gradient flows from the policy through the weight (Algorithm 1).
+    """
+
+    def __init__(
+        self, observation_space: spaces.Dict, action_space: spaces.Box, lr_schedule: Schedule, **keywords: Any
+    ) -> None:
+        angles = spaces.Box(action_space.low[:2], action_space.high[:2])
+        settings = {
+            "features_extractor_class": AttentionExtractor,
+            "net_arch": [128],
+            "activation_fn": nn.ReLU,
+            "log_std_init": -0.5,
+        }
+        super().__init__(observation_space, angles, lr_schedule, **{**keywords, **settings})
+        self.action_space = action_space
+
+    def forward(
+        self, obs: dict[str, torch.Tensor], deterministic: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Actions (B, 3), values (B, 1) and log probabilities (B,)."""
+        latent_pi, latent_vf = self.mlp_extractor(self.extract_features(obs))
+        distribution = self._get_action_dist_from_latent(latent_pi)
+        angles = distribution.get_actions(deterministic=deterministic)
+        return self._with_index(angles), self.value_net(latent_vf), distribution.log_prob(angles)
+
+    def evaluate_actions(
+        self, obs: dict[str, torch.Tensor], actions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Values, log probabilities and entropies of (B, 3) actions, of which only the angles count."""
+        return super().evaluate_actions(obs, actions[:, :2])
+
+    def _predict(self, observation: dict[str, torch.Tensor], deterministic: bool = False) -> torch.Tensor:
+        angles = self.get_distribution(observation).get_actions(deterministic=deterministic)
+        return self._with_index(angles)
+
+    def _with_index(self, angles: torch.Tensor) -> torch.Tensor:
+        return torch.cat([angles, self.features_extractor.attended[:, None].to(angles.dtype)], dim=1)
+
+    def network(self) -> AttentionNetwork:
+        """The deployable part, a copy."""
+        extractor = self.features_extractor
+        network = AttentionNetwork(extractor.steps, rule=extractor.attention.rule)
+        network.attention.load_state_dict(extractor.attention.state_dict())
+        network.policy.load_state_dict(self.mlp_extractor.policy_net.state_dict())
+        network.mean.load_state_dict(self.action_net.state_dict())
+        network.log_std.data.copy_(self.log_std.data)
+        return network.eval()
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One line of the curve.
+
+    Attributes:
+        steps: environment steps so far.
+        seconds: of training so far.
+        detection_rate: on the validation scenes.
+        e_add_mm: there.
+        distance_m: there.
+        mean_return: of the latest training episodes.
+    """
+
+    steps: int
+    seconds: float
+    detection_rate: float
+    e_add_mm: float
+    distance_m: float
+    mean_return: float
+
+
+def train_ppo(
+    train: BatchedFusion,
+    validation: BatchedFusion,
+    folder: Path,
+    parameters: PpoParameters | None = None,
+    reward: RewardParameters | None = None,
+    *,
+    resume: bool = False,
+) -> Iterator[Progress]:
+    """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
+
+    ``folder`` receives ``curve.jsonl``, ``best.safetensors`` with its JSON (highest validation detection rate, lower
+    e_ADD of equals), and ``latest.safetensors`` with ``latest.json`` to go on from.
+
+    Args:
+        train: scenes to train on.
+        validation: scenes to choose the best on.
+        folder: of the results.
+        parameters: how to train.
+        reward: weights and scales of the reward.
+        resume: go on from ``latest``; the parameters must be those of before, ``total`` excepted.
+
+    Raises:
+        ValueError: there is nothing to resume from, or with other parameters.
+    """
+    parameters, reward = parameters or PpoParameters(), reward or RewardParameters()
+    folder.mkdir(parents=True, exist_ok=True)
+    ppo = _make_ppo(train, parameters, reward)
+    identity = {"parameters": asdict(parameters) | {"total": 0}, "reward": asdict(reward)}
+    curve, best, begun = folder / "curve.jsonl", (-1.0, 0.0), time.perf_counter()
+    if resume:
+        best, seconds = _restore(ppo, folder, identity)
+        begun -= seconds
+    else:
+        curve.unlink(missing_ok=True)
+    while ppo.num_timesteps < parameters.total:
+        chunk = min(parameters.evaluate_every, parameters.total - ppo.num_timesteps)
+        ppo.learn(chunk, reset_num_timesteps=False, progress_bar=False)
+        network = ppo.policy.network()
+        measured = validate(network, validation, parameters.steps)
+        returns = [episode["r"] for episode in ppo.ep_info_buffer or []]
+        mean_return = float(np.mean(returns)) if returns else float("nan")
+        progress = Progress(ppo.num_timesteps, time.perf_counter() - begun, *measured, mean_return)
+        with curve.open("a") as file:
+            file.write(json.dumps(asdict(progress)) + "\n")
+        if (progress.detection_rate, -progress.e_add_mm) > best:
+            best = (progress.detection_rate, -progress.e_add_mm)
+            save_network(network, folder / "best.safetensors", {**identity, "validation": asdict(progress)})
+        _checkpoint(ppo, folder, {**identity, "best": best, "seconds": progress.seconds})
+        yield progress
+
+
+def _make_ppo(lookup: BatchedFusion, parameters: PpoParameters, reward: RewardParameters) -> PPO:
+    environment = BankVecEnv(Active6DVectorEnv(lookup, parameters.environments, steps=parameters.steps, reward=reward))
+    return PPO(
+        PaperPolicy,
+        environment,
+        policy_kwargs={"features_extractor_kwargs": {"rule": parameters.attend}},
+        learning_rate=parameters.learning_rate,
+        n_steps=parameters.rollout,
+        batch_size=parameters.batch,
+        n_epochs=parameters.epochs,
+        gamma=parameters.gamma,
+        ent_coef=parameters.entropy,
+        seed=parameters.seed,
+    )
+
+
+def validate(network: AttentionNetwork, lookup: BatchedFusion, steps: int) -> tuple[float, float, float]:
+    """Detection rate, e_ADD (mm) and metres of the network's mean actions over all scenes and starting views."""
+    scenes, views = len(lookup.bank.scenes), len(lookup.sphere)
+    episodes = Episodes(lookup, scenes * views, steps)
+    everything = np.arange(scenes * views)
+    episodes.begin(everything, np.random.default_rng(0), everything // views, everything % views)
+    with torch.inference_mode():
+        for _ in range(steps):
+            observation = {name: torch.from_numpy(values) for name, values in episodes.observe().items()}
+            mean, _, index = network(observation)
+            episodes.move(np.column_stack([mean.clamp(-1.0, 1.0).double().numpy(), index.numpy()]))
+    return tuple(float(values.mean()) for values in episodes.results().values())
+
+
+def _checkpoint(ppo: PPO, folder: Path, state: dict) -> None:
+    """Weights and Adam's moments as tensors, the rest as JSON: nothing pickled."""
+    tensors = {f"policy.{name}": value for name, value in ppo.policy.state_dict().items()}
+    for index, moments in ppo.policy.optimizer.state_dict()["state"].items():
+        tensors |= {f"adam.{index}.{name}": value for name, value in moments.items()}
+    # Cloned, because the policy names its extractor three times and safetensors refuses shared memory.
+    save_file({name: value.detach().cpu().clone() for name, value in tensors.items()}, folder / "latest.safetensors")
+    (folder / "latest.json").write_text(json.dumps({**state, "steps": ppo.num_timesteps}, indent=2) + "\n")
+
+
+def _restore(ppo: PPO, folder: Path, identity: dict) -> tuple[tuple[float, float], float]:
+    """Load a checkpoint into ``ppo``; the best so far and the seconds spent."""
+    path = folder / "latest.safetensors"
+    try:
+        state, tensors = json.loads(path.with_suffix(".json").read_text()), load_file(path)
+    except Exception as error:  # safetensors raises its own kinds
+        raise ValueError(f"{path}: nothing to resume from ({error})") from error
+    if any(state.get(key) != value for key, value in identity.items()):
+        raise ValueError(f"{path}: was trained with other parameters; start anew without resuming")
+    ppo.policy.load_state_dict({k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")})
+    adam: dict[int, dict[str, torch.Tensor]] = {}
+    for key, value in tensors.items():
+        if key.startswith("adam."):
+            _, index, name = key.split(".")
+            adam.setdefault(int(index), {})[name] = value
+    ppo.policy.optimizer.load_state_dict({**ppo.policy.optimizer.state_dict(), "state": adam})
+    ppo.num_timesteps = int(state["steps"])
+    # The same scenes again would be the seed's; go on with others.
+    ppo.set_random_seed(ppo.seed + ppo.num_timesteps)
+    return tuple(state["best"]), float(state["seconds"])

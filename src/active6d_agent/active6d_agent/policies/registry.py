@@ -1,0 +1,158 @@
+"""What a policy sees, what it decides, and how policies are found by name.
+
+A policy needs nothing that a robot does not have: the fused objects and the surface that is of none of them, where the
+camera has been, which views it may take, and what is left of its budget (paper, "Problem definition"). The node, the
+environment and the evaluation all speak to policies through this module.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.object_model import ObjectModel, find_beside
+from active6d_core.registry import Registry
+from active6d_core.view_sphere import ViewSphere
+
+#: Trained policies that come with this package.
+SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
+#: A view of the grid counts as visited when the camera was this close to it, metres of arc.
+VISITED_WITHIN = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What is known after t moves.
+
+    Attributes:
+        objects: the n accumulated objects, their boxes and depths in the current camera.
+        positions: (t + 1, 3) camera positions in the world so far, the current one last, metres.
+        sphere: the grid of views.
+        allowed: (M,) bool, views of the grid that the camera can reach.
+        steps_left: moves left, at least 1.
+        metres_left: arc left on the sphere, ``inf`` without such a budget.
+        unexplained: (k, 3) places of the surface that depth images have shown and that is of none of the objects,
+            metres in the world.
+    """
+
+    objects: SceneObjects
+    positions: np.ndarray
+    sphere: ViewSphere
+    allowed: np.ndarray
+    steps_left: int
+    metres_left: float = np.inf
+    unexplained: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def steps(self) -> int:
+        """The budget T of the episode in moves."""
+        return len(self.positions) - 1 + self.steps_left
+
+    def visited(self) -> np.ndarray:
+        """(M,) bool, views of the grid that the camera has taken."""
+        grid, taken = self.sphere.positions / self.sphere.radius, self.positions
+        taken = taken / np.linalg.norm(taken, axis=1, keepdims=True)
+        return (grid @ taken.T).max(axis=1) > np.cos(VISITED_WITHIN / self.sphere.radius)
+
+    def candidates(self) -> np.ndarray:
+        """(M,) bool, views that may be next: reachable, not visited, within the metres left."""
+        candidates = self.allowed & ~self.visited()
+        if self.metres_left < np.inf:
+            candidates &= self.sphere.arc(self.sphere.positions, self.positions[-1]) <= self.metres_left
+        return candidates
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """Where the camera should go, and why.
+
+    Attributes:
+        position: (3,) goal on the sphere in the world, metres; the current position when stopping.
+        view: index of the goal in the grid, None when it lies off the grid or the episode stops.
+        attention: (n,) weight of each object, summing to one (for n > 0).
+        attended: index of the object that the move is for, None when the policy looks at no one object.
+        stop: end the episode here instead of moving.
+    """
+
+    position: np.ndarray
+    view: int | None
+    attention: np.ndarray
+    attended: int | None = None
+    stop: bool = False
+
+    @classmethod
+    def go_to(
+        cls, observation: Observation, view: int, attention: np.ndarray | None = None, attended: int | None = None
+    ) -> "Decision":
+        """Move to a view of the grid; without ``attention`` all objects weigh the same."""
+        if attention is None:
+            attention = uniform_attention(len(observation.objects))
+        return cls(observation.sphere.positions[view], int(view), attention, attended)
+
+    @classmethod
+    def stop_here(cls, observation: Observation) -> "Decision":
+        """End the episode at the current view."""
+        return cls(observation.positions[-1], None, uniform_attention(len(observation.objects)), stop=True)
+
+
+class Policy(Protocol):
+    """Chooses the next view."""
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Begin an episode; ``rng`` is the only source of randomness until the next one."""
+
+    def decide(self, observation: Observation) -> Decision:
+        """The next move; a policy stops when the observation leaves it no candidate."""
+
+
+def weights_path(policy: str, object_name: str) -> Path:
+    """Where weights of a policy for an object are, or would be: beside its description, or where shipped ones are."""
+    return find_beside(f"{policy}_{object_name}.safetensors", SHIPPED_WEIGHTS)
+
+
+def choose_policy(object_name: str) -> str:
+    """What ``auto`` stands for: the learned policy where there are weights, else the rule that finds most."""
+    return "view-attention" if weights_path("view-attention", object_name).is_file() else "unidirectional"
+
+
+_BASELINES = "random", "unidirectional", "max-distance", "lowest-score", "single-view", "entropy"
+_registry = Registry(
+    "policy",
+    choose_policy,
+    {
+        **dict.fromkeys(_BASELINES, "active6d_agent.policies.baselines"),
+        "attention": "active6d_agent.policies.attention.network",
+        "view-attention": "active6d_agent.policies.view_attention.network",
+    },
+)
+#: Decorates a factory ``(model, **parameters) -> Policy``; see :meth:`active6d_core.registry.Registry.register`.
+register_policy = _registry.register
+#: Names that :func:`create_policy` knows beside ``auto``.
+list_policies = _registry.names
+
+
+def create_policy(name: str, model: ObjectModel, **parameters: Any) -> Policy:
+    """Make a policy by name.
+
+    Args:
+        name: one of :func:`list_policies`, or ``auto`` for :func:`choose_policy`'s choice.
+        model: the object that fills the bin.
+        parameters: of that policy; its class documents them.
+
+    Raises:
+        ValueError: no such policy, no such parameter, or a value out of range; the message names it.
+    """
+    return _registry.create(name, model, **parameters)
+
+
+def uniform_attention(count: int) -> np.ndarray:
+    """(n,) equal weights that sum to one."""
+    return np.full(count, 1.0 / max(count, 1))
+
+
+def softmax(logits: np.ndarray) -> np.ndarray:
+    """(n,) logits to (n,) weights that sum to one; empty in, empty out."""
+    weights = np.exp(logits - logits.max(initial=-np.inf))
+    return weights / weights.sum() if len(weights) else weights

@@ -1,0 +1,469 @@
+"""Training ``view-attention`` on a scene bank: train_dagger what the truth says of every view.
+
+The truth says for every candidate view what it would gain, and what could still be gained after it, by a fixed rule for
+the moves that remain: views that lie far from all taken ones (:func:`spread`). So one visited state teaches a hundred
+views. States are those that the learner itself comes to (DAgger), with some random moves and budgets of every length.
+"""
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.optim.swa_utils import AveragedModel
+
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.evaluation.oracle import known
+from active6d_agent.evaluation.policy_evaluation import MEASURES, all_starts, measure, observe, run_named
+from active6d_agent.policies.registry import Observation
+from active6d_agent.policies.view_attention.features import MAX_OBJECTS, SceneState, gather, represent
+from active6d_agent.policies.view_attention.network import (
+    GAINS,
+    ViewAttention,
+    Weighing,
+    load_network,
+    save_network,
+    value_views,
+)
+from active6d_core.object_model import ObjectModel
+from active6d_core.view_sphere import ViewSphere
+
+# Episodes that the network values together: more are no faster and need memory.
+_TOGETHER = 32
+# The weights that play are a mean over about as many steps as four rounds have.
+_MEAN_DECAY = 0.995
+# What is tried for the weighing.
+_LOOKAHEADS = (0.0, 0.25, 0.5, 1.0)
+_METRES_WEIGHTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+# A patch is surface of a true object whose middle is within this fraction of the diameter.
+_PATCH_REACH = 0.75
+# Of the loss about all gains to the end, against that about the next view's.
+_LATER_WEIGHT = 0.1
+# Variance over a state's views, in objects squared, that counts as none.
+_VARIANCE_FLOOR = 0.1
+
+
+@dataclass(frozen=True)
+class DaggerParameters:
+    """How to train.
+
+    Attributes:
+        steps: horizon T of validation.
+        longest: training episodes have 1 to this many moves.
+        rounds: of collecting states and learning from all of them.
+        episodes: of each round.
+        updates: steps of the optimiser each round.
+        batch: states per step.
+        views: of each state that one step learns from.
+        learning_rate: of Adam at first; falls to nothing along a cosine.
+        explore: share of random moves.
+        capacity: states kept, the latest.
+        starts: validation episodes.
+        evaluate_every: rounds between validations.
+        object_weight: of the loss about single objects, against that about a view's sum.
+        hidden: width of the network.
+        seed: of everything.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+
+    steps: int = 5
+    longest: int = 8
+    rounds: int = 30
+    episodes: int = 32
+    updates: int = 100
+    batch: int = 96
+    views: int = 32
+    learning_rate: float = 2e-3
+    explore: float = 0.2
+    capacity: int = 12_000
+    starts: int = 300
+    evaluate_every: int = 5
+    object_weight: float = 1.0
+    hidden: int = 32
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.explore <= 1:
+            raise ValueError(f"training: explore must be in [0, 1], got {self.explore}")
+        for name in asdict(self).keys() - {"explore", "learning_rate", "object_weight", "seed"}:
+            if getattr(self, name) < 1:
+                raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"training: learning_rate must be positive, got {self.learning_rate}")
+
+
+@dataclass(frozen=True)
+class DaggerProgress:
+    """One line of the curve.
+
+    Attributes:
+        round: rounds done.
+        seconds: of training so far.
+        states: labelled so far.
+        loss: mean of the round.
+        detection_rate: on the validation scenes.
+        e_add_mm: there.
+        distance_m: there.
+    """
+
+    round: int
+    seconds: float
+    states: int
+    loss: float
+    detection_rate: float
+    e_add_mm: float
+    distance_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One state and what its views gain.
+
+    Attributes:
+        state: what was known.
+        now: (M, n + 1, 2) :func:`candidate_gains`.
+        later: (M, n + 1, 2) likewise.
+    """
+
+    state: SceneState
+    now: np.ndarray
+    later: np.ndarray
+
+
+def train_dagger(
+    train: BatchedFusion,
+    validation: BatchedFusion,
+    folder: Path,
+    parameters: DaggerParameters | None = None,
+    weighing: Weighing | None = None,
+    *,
+    resume: bool = False,
+) -> Iterator[DaggerProgress]:
+    """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
+
+    ``folder`` receives ``curve.jsonl``, ``best.safetensors`` (highest validation detection rate, lower e_ADD of equals)
+    and ``latest.safetensors``, each with its JSON. At the end the best is given the weighing that suits it
+    (:func:`choose_weighing`).
+
+    Args:
+        train: scenes to train on.
+        validation: scenes to choose the best on.
+        folder: of the results.
+        parameters: how to train.
+        weighing: what counts for the learner.
+        resume: go on from ``latest`` with newly collected states.
+
+    Raises:
+        ValueError: there is nothing to resume from.
+    """
+    parameters, weighing = parameters or DaggerParameters(), weighing or Weighing()
+    folder.mkdir(parents=True, exist_ok=True)
+    learner = _Learner(train, parameters, weighing)
+    curve, latest, best, begun = folder / "curve.jsonl", folder / "latest.safetensors", (-1.0, 0.0), time.perf_counter()
+    if resume:
+        best, seconds = learner.restore(latest)
+        begun -= seconds
+    else:
+        curve.unlink(missing_ok=True)
+    starts = all_starts(validation, parameters.starts, parameters.seed)
+    while learner.round < parameters.rounds:
+        loss = learner.advance()
+        if learner.round % parameters.evaluate_every and learner.round < parameters.rounds:
+            continue
+        measured = validate(learner.network, validation, starts, parameters.steps)
+        progress = DaggerProgress(learner.round, time.perf_counter() - begun, learner.states, loss, *measured)
+        with curve.open("a") as file:
+            file.write(json.dumps(asdict(progress)) + "\n")
+        made = {"parameters": asdict(parameters), "progress": asdict(progress), "bank": train.bank.provenance}
+        if (progress.detection_rate, -progress.e_add_mm) > best:
+            best = (progress.detection_rate, -progress.e_add_mm)
+            save_network(learner.network, folder / "best.safetensors", train.model.name, made)
+        save_network(learner.network, latest, train.model.name, {**made, "best": best})
+        yield progress
+    settle(folder / "best.safetensors", validation, starts, parameters.steps)
+
+
+def settle(path: Path, validation: BatchedFusion, starts: np.ndarray, steps: int) -> None:
+    """Give stored weights the weighing of :func:`choose_weighing`; for its arguments see there."""
+    network = load_network(path, validation.model.name)
+    provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
+    network.weighing = choose_weighing(network, validation, starts, steps)
+    settled = dict(zip(MEASURES, validate(network, validation, starts, steps), strict=True))
+    save_network(network, path, validation.model.name, {**provenance, "settled": settled})
+
+
+def choose_weighing(network: ViewAttention, validation: BatchedFusion, starts: np.ndarray, steps: int) -> Weighing:
+    """The weight of later gains that finds most on the validation scenes, then likewise that of metres, among those
+    that make no longer ways than the random policy does.
+
+    Args:
+        network: whose weighing is the beginning, and stays as it is otherwise.
+        validation: scenes to choose on.
+        starts: (E, 2) scenes and first views.
+        steps: moves T.
+    """
+    most_metres = run_named(validation, "random", starts, steps).distance_m.mean()
+    given, weighing = network.weighing, network.weighing
+    for name, values in (("lookahead", _LOOKAHEADS), ("metres_weight", _METRES_WEIGHTS)):
+        results = []
+        for value in values:
+            network.weighing = replace(weighing, **{name: value})
+            rate, error, metres = validate(network, validation, starts, steps)
+            fits = name == "lookahead" or metres <= most_metres
+            results.append((fits, rate if fits else -metres, -error, network.weighing))
+        weighing = max(results, key=lambda result: result[:3])[-1]
+    network.weighing = given
+    return weighing
+
+
+def validate(
+    network: ViewAttention, lookup: BatchedFusion, starts: np.ndarray, steps: int
+) -> tuple[float, float, float]:
+    """Detection rate, e_ADD (mm) and metres of the network's moves from (E, 2) starts."""
+    views = np.full((len(starts), steps + 1), -1)
+    views[:, 0] = starts[:, 1]
+    played = roll_out(lookup, greedy(network, lookup.model), starts[:, 0], views, np.full(len(starts), steps))
+    result = measure(lookup, starts[:, 0], played)
+    return float(result.detection_rate.mean()), float(result.e_add_mm.mean()), float(result.distance_m.mean())
+
+
+def greedy(network: ViewAttention, model: ObjectModel) -> Callable[[list[Observation]], np.ndarray]:
+    """Observations to (B,) views of most worth."""
+
+    def choose(observations: list[Observation]) -> np.ndarray:
+        states = [represent(each, model) for each in observations]
+        return _worths(network, observations, states).argmax(axis=1)
+
+    return choose
+
+
+def _worths(network: ViewAttention, observations: list[Observation], states: list[SceneState]) -> np.ndarray:
+    """(B, M) worth of every view by what the network weighs."""
+    parts = [slice(start, start + _TOGETHER) for start in range(0, len(observations), _TOGETHER)]
+    values = [value_views(network, observations[part], states[part], network.weighing) for part in parts]
+    return np.concatenate([each.worth for each in values])
+
+
+def roll_out(
+    lookup: BatchedFusion,
+    choose: Callable[[list[Observation]], np.ndarray],
+    scene: np.ndarray,
+    views: np.ndarray,
+    left: np.ndarray,
+) -> np.ndarray:
+    """Play E episodes to their ends.
+
+    Args:
+        lookup: of the bank.
+        choose: observations to (B,) views.
+        scene: (E,) indices.
+        views: (E, v) taken so far, -1 padding at the end, with room for the rest.
+        left: (E,) moves left.
+
+    Returns:
+        (E, v) all views taken.
+    """
+    views, left = views.copy(), left.copy()
+    while (running := np.flatnonzero(left > 0)).size:
+        count = (views[running] >= 0).sum(axis=1)
+        views[running, count] = choose(observe(lookup, scene[running], views[running], left[running]))
+        left[running] -= 1
+    return views
+
+
+def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
+    """(E, v) views to (E, v + moves): each next one is the view at 60 degrees farthest from all taken ones, the nearest
+    of equals. It needs nothing but geometry, and can go on from any views."""
+    arcs = sphere.arc(sphere.positions[:, None], sphere.positions)
+    elevation = np.arcsin(sphere.positions[:, 2] / sphere.radius)
+    ring = np.flatnonzero(np.isclose(elevation, elevation[np.abs(elevation - np.pi / 3).argmin()]))
+    for _ in range(moves):
+        farness = arcs[paths][:, :, ring].min(axis=1) - 1e-3 * arcs[paths[:, -1]][:, ring]
+        paths = np.column_stack([paths, ring[farness.argmax(axis=1)]])
+    return paths
+
+
+def candidate_gains(
+    lookup: BatchedFusion, scene: int, views: np.ndarray, left: int, patches: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What each view adds to the (v,) views taken, and what :func:`spread` adds in the moves that are left after it.
+
+    Returns:
+        Twice (M, n + 1, 2), NaN for views taken: gains (:func:`.oracle.known`) of the true objects that
+        the n items stand for, which are the accumulated objects in the order of
+        :func:`.features.best_verified` and the (m, 3) middles ``patches``; of several for one true
+        object the first has the gain. Last, what all true objects gain that none stands for.
+    """
+    free = np.setdiff1d(np.arange(len(lookup.sphere)), views)
+    paths = np.column_stack([np.tile(views, (len(free), 1)), free])
+    before = known(lookup, np.array([scene]), views[None])
+    after, ended = (
+        known(lookup, np.full(len(free), scene), each) for each in (paths, spread(lookup.sphere, paths, left - 1))
+    )
+    rows = lookup.fuse(np.array([scene]), views[None], views[-1:]).objects[0]
+    column, stands_for = stand_for(lookup, scene, rows, patches)
+    count = min(len(rows), MAX_OBJECTS) + len(patches)
+    gains = np.full((2, len(lookup.sphere), count + 1, GAINS), np.nan)
+    gains[:, free] = 0.0
+    for part, added in zip(gains, (after - before, ended - after), strict=True):
+        part[free[:, None], column] = added[:, stands_for]
+        part[free, -1] = added.sum(axis=1) - added[:, stands_for].sum(axis=1)
+    return gains[0], gains[1]
+
+
+def stand_for(
+    lookup: BatchedFusion, scene: int, rows: np.ndarray, patches: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Items that stand for true objects, and those objects: an accumulated object, of the hypotheses ``rows``, for the
+    one that it is best for; a patch for the nearest that no accumulated object stands for."""
+    order = np.argsort(-lookup.verification[rows], kind="stable")
+    stands_for, best = np.unique(lookup.nearest_object[rows], return_index=True)
+    column = np.argsort(order)[best]
+    told = column < MAX_OBJECTS
+    stands_for, column = stands_for[told], column[told]
+    true = lookup.bank.scenes[scene].T_world_object[:, :3, 3]
+    apart = np.linalg.norm(patches[:, None] - true, axis=-1)
+    apart[:, stands_for] = np.inf
+    for patch, distances in enumerate(apart):
+        nearest = int(distances.argmin())
+        if distances[nearest] < _PATCH_REACH * lookup.model.diameter:
+            stands_for = np.append(stands_for, nearest)
+            column = np.append(column, min(len(rows), MAX_OBJECTS) + patch)
+            apart[:, nearest] = np.inf
+    return column, stands_for
+
+
+class _Learner:
+    """The network, its optimiser and the states that it learns from."""
+
+    def __init__(self, lookup: BatchedFusion, parameters: DaggerParameters, weighing: Weighing) -> None:
+        torch.manual_seed(parameters.seed)
+        self.lookup, self.parameters, self._weighing = lookup, parameters, weighing
+        self._trained = ViewAttention(parameters.hidden)
+        self.optimizer = torch.optim.Adam(self._trained.parameters(), parameters.learning_rate, weight_decay=1e-5)
+        # What plays and is kept is a running mean of the weights: it does better on other scenes than the latest.
+        self._average = AveragedModel(self._trained, avg_fn=_running_mean).eval()
+        self.network: ViewAttention = self._average.module
+        self.network.weighing = weighing
+        self.rng = np.random.default_rng(parameters.seed)
+        self.memory: deque[Example] = deque(maxlen=parameters.capacity)
+        self.round, self.states = 0, 0
+
+    def restore(self, path: Path) -> tuple[tuple[float, float], float]:
+        """Take the weights of an earlier training; the best so far and the seconds spent."""
+        stored = load_network(path, self.lookup.model.name)
+        for network in (self._trained, self.network):
+            network.load_state_dict(stored.state_dict())
+        self.network.weighing = stored.weighing
+        provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
+        progress = provenance["progress"]
+        self.round, self.states = progress["round"], progress["states"]
+        # The same scenes again would be the seed's; go on with others.
+        self.rng = np.random.default_rng([self.parameters.seed, self.round])
+        return tuple(provenance["best"]), progress["seconds"]
+
+    def advance(self) -> float:
+        """One round; its mean loss."""
+        self._collect()
+        share = self.round / self.parameters.rounds
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.parameters.learning_rate * (0.02 + 0.98 * (1 + np.cos(np.pi * share)) / 2)
+        loss = float(np.mean([self._update() for _ in range(self.parameters.updates)]))
+        self.round += 1
+        return loss
+
+    def _collect(self) -> None:
+        """Play episodes as the learner does now, and label every state on the way."""
+        lookup, rng, count = self.lookup, self.rng, self.parameters.episodes
+        scene = rng.integers(len(lookup.bank.scenes), size=count)
+        left = rng.integers(1, self.parameters.longest + 1, size=count)
+        views = np.full((count, self.parameters.longest + 1), -1)
+        views[:, 0] = rng.integers(len(lookup.sphere), size=count)
+        # The oracle leads until the learner has learned something.
+        lead = max(0.0, 1.0 - 5.0 * self.round / self.parameters.rounds)
+
+        def choose(observations: list[Observation]) -> np.ndarray:
+            running = np.flatnonzero(left > 0)
+            states = [represent(each, lookup.model) for each in observations]
+            values = _worths(self.network, observations, states)
+            visited = zip(scene[running], views[running], left[running], states, strict=True)
+            gains = [
+                candidate_gains(lookup, index, taken[taken >= 0], moves, state.patches)
+                for index, taken, moves, state in visited
+            ]
+            self.memory.extend(Example(state, *both) for state, both in zip(states, gains, strict=True))
+            self.states += len(observations)
+            truths = [(now + later).sum(axis=1) @ [1.0, self._weighing.error_weight] for now, later in gains]
+            best = [self._best(truth, worth, lead) for truth, worth in zip(truths, values, strict=True)]
+            views[running, (views[running] >= 0).sum(axis=1)] = best
+            left[running] -= 1
+            return np.array(best)
+
+        roll_out(lookup, choose, scene, views, left)
+
+    def _best(self, truth: np.ndarray, worth: np.ndarray, lead: float) -> int:
+        """The next view of a training episode."""
+        if self.rng.random() < self.parameters.explore:
+            return int(self.rng.choice(np.flatnonzero(np.isfinite(worth))))
+        return int(np.nanargmax(truth) if self.rng.random() < lead else worth.argmax())
+
+    def _update(self) -> float:
+        drawn = [self.memory[i] for i in self.rng.integers(len(self.memory), size=self.parameters.batch)]
+        some = self.rng.permutation(len(self.lookup.sphere))[: self.parameters.views]
+        state = gather([example.state for example in drawn], some)
+        nows, laters = self._trained.explain(state)
+        now = _labels([example.now for example in drawn], some, nows.shape[2])
+        later = _labels([example.later for example in drawn], some, nows.shape[2])
+        # What comes next decides more than what may come after it, and is surer.
+        weight = self.parameters.object_weight
+        loss = _loss(nows, now, weight) + _LATER_WEIGHT * _loss(nows + laters, now + later, weight)
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self._trained.parameters(), 1.0)
+        self.optimizer.step()
+        self._average.update_parameters(self._trained)
+        return float(loss.detach())
+
+
+def _running_mean(mean: torch.Tensor, value: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+    """Exponential, but at first over all there is, or it would remember where the training began."""
+    return torch.lerp(value, mean, torch.clamp((1 + count) / (10 + count), max=_MEAN_DECAY))
+
+
+def _labels(gains: list[np.ndarray], views: np.ndarray, count: int) -> np.ndarray:
+    """(B, M', count, 2) gains of (M',) views, padded before what no object stands for."""
+    padded = np.zeros((len(gains), len(views), count, GAINS), np.float32)
+    for row, own in zip(padded, gains, strict=True):
+        row[:, : own.shape[1] - 1], row[:, -1] = own[views, :-1], own[views, -1]
+    return padded
+
+
+def _loss(predicted: torch.Tensor, truth: np.ndarray, object_weight: float) -> torch.Tensor:
+    """Square error of (B, M, n + 1, 2) gains where they are known: of their sums over the objects, of which the
+    differences between the views of a state count most, and of each object's."""
+    target = torch.from_numpy(truth)
+    labelled = torch.isfinite(target[:, :, -1:, :1])
+    off = torch.where(labelled, predicted - torch.nan_to_num(target), 0.0)
+    count = labelled.sum(dim=1, keepdim=True).clamp(min=1)
+    weight = _weigh_states(truth)[:, None, None]
+    total = off.sum(dim=2, keepdim=True)
+    level = total.sum(dim=1, keepdim=True) / count
+    about = torch.where(labelled, total - level, 0.0) ** 2 / count * weight[..., None]
+    own = off**2 / count * weight[..., None]
+    return (about.sum() + object_weight * own.sum()) / len(truth) + 0.25 * (level[:, 0, 0] ** 2 * weight[:, 0]).mean()
+
+
+def _weigh_states(truth: np.ndarray) -> torch.Tensor:
+    """(B,) weights that sum to B: the less the gains of a state's views differ, the more each counts.
+
+    The first moves find many objects and the last ones few, which a plain square error hardly notices, though finding
+    them decides who wins.
+    """
+    weight = 1.0 / (np.nanvar(truth[..., 0].sum(axis=2), axis=1) + _VARIANCE_FLOOR)
+    return torch.from_numpy((weight / weight.mean()).astype(np.float32))

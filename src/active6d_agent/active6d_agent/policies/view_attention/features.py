@@ -1,0 +1,297 @@
+"""What ``view-attention`` looks at: accumulated objects, unexplained patches of surface, and what views show of them.
+
+A patch stands for an object that no hypothesis speaks of: depth images show some of its surface, and no accumulated
+object explains it. How much of each object and patch every view of the grid would show past the other objects comes
+from :mod:`active6d_perception.scene.expected_visibility`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+import torch
+from scipy.spatial.distance import cdist
+
+from active6d_agent.policies.registry import Observation
+from active6d_core.object_model import ObjectModel
+from active6d_perception.compiled import compiled
+from active6d_perception.model.model_views import model_views
+from active6d_perception.scene.expected_visibility import Tray, expected_visibility
+
+#: Objects beyond these are left out, the best verified being kept.
+MAX_OBJECTS = 64
+#: Patches beyond these are left out, the largest being kept.
+MAX_PATCHES = 8
+#: What is known of an item, of an item and a view, and of a view, see :class:`SceneState` and :func:`gather`.
+ITEM_FEATURES, PAIR_FEATURES, VIEW_FEATURES = 18, 12, 8
+# Points of surface within this fraction of the diameter are one patch, and so many are needed.
+_PATCH_RADIUS = 0.45
+_FEWEST_POINTS = 4
+# More points than these are thinned out.
+_MOST_POINTS = 240
+# Unexplained surface is counted within these distances of an item's middle, in diameters, and so many points are one.
+_NEAR_MIDDLE = (0.35, 0.65)
+_POINTS_OF_ONE = 50
+# Where the middle of an object is looked for about the middle of its patch, in diameters: most of it is below.
+_PLACES = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 5)] * 2, np.linspace(-0.5, 0.1, 4)), axis=-1).reshape(-1, 3)
+# Surface within this distance has a vote in that, in diameters, but no more points than these.
+_VOTERS_WITHIN = 0.7
+_MOST_VOTERS = 60
+# Standard deviation of the surface's distance from the middle that votes allow for, in diameters.
+_SHELL = 0.12
+# A twentieth of all votes more makes a place e times as likely.
+_SHARPNESS = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class SceneState:
+    """n items, which are objects first and then patches, and the views about them.
+
+    Attributes:
+        pose: (n, 3, 4) in the world; a patch has the guessed middle of its object, and zeros for a rotation.
+        scalars: (n, 7) verification, score, spread in metres, share of the views that support the object; 1 for a
+            patch; unexplained surface near the middle and farther about it, of which right poses leave little.
+        shown: (n, M) share that each view of the grid would show past the objects in between.
+        seen: (n, t) the same of the views taken.
+        taken: (t, 3) positions of the camera, the current one last.
+        grid: (M, 3) positions of the views.
+        left: moves left.
+        diameter: of an object.
+        axis: (3,) of its continuous symmetry, object frame, zeros without one.
+    """
+
+    pose: np.ndarray
+    scalars: np.ndarray
+    shown: np.ndarray
+    seen: np.ndarray
+    taken: np.ndarray
+    grid: np.ndarray
+    left: int
+    diameter: float
+    axis: np.ndarray
+
+    @property
+    def patches(self) -> np.ndarray:
+        """(m, 3) where the middles of the patches' objects are guessed to be."""
+        return self.pose[self.scalars[:, 4] > 0, :, 3]
+
+    @cached_property
+    def items(self) -> np.ndarray:
+        """(n, 18) float32, what is known of each by itself; of the world's directions only the vertical counts."""
+        verification, score, spread, *rest = self.scalars.T
+        centre, upright = self.pose[:, :, 3], self.pose[:, 2, :3]
+        apart = (centre - centre[:, None]) / self.diameter
+        near = np.exp(-(apart**2).sum(axis=-1))
+        moves = np.full(len(centre), self._few(len(self.taken) - 1))
+        columns = [
+            verification,
+            score,
+            np.minimum(spread / self.diameter, 1.0),
+            *rest,
+            centre[:, 2] / self.diameter,
+            np.linalg.norm(centre[:, :2], axis=1) / (2 * self.diameter),
+            near.sum(axis=1) / 3,
+            (near * np.maximum(apart[..., 2], 0.0)).sum(axis=1),
+            self.seen.max(axis=1),
+            self.seen[:, -1],
+            self.seen.sum(axis=1) / 3,
+            moves,
+            *_sides(upright, self.axis).T,
+        ]
+        return np.stack(columns, axis=1).astype(np.float32)
+
+    @cached_property
+    def outlooks(self) -> np.ndarray:
+        """(M, 8) float32, what is known of each view by itself: its height and the camera's, the ways to it from the
+        camera and from the nearest view taken, moves made and left, the number of items, and how near the end is."""
+        outlook, heading = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (self.grid, self.taken))
+        # Just off the ends, where the angle has no derivative.
+        arcs = np.arccos((outlook @ heading.T).clip(-1.0, 1.0) * np.float32(0.999999)) / np.float32(np.pi)
+        moves, left = self._few(len(self.taken) - 1), self._few(self.left)
+        known = np.empty((len(outlook), VIEW_FEATURES), np.float32)
+        known[:, 0], known[:, 1] = outlook[:, 2], heading[-1, 2]
+        known[:, 2], known[:, 3] = arcs[:, -1], arcs.min(axis=1)
+        known[:, 4:] = moves, left, len(self.pose) / 20, 1 / (1 + 5 * left)
+        return known
+
+    @staticmethod
+    def _few(moves: int) -> float:
+        """A number of moves in fives, of many only that there are many."""
+        return min(moves / 5, 2.0)
+
+
+def best_verified(observation: Observation) -> np.ndarray:
+    """Indices of the objects that are looked at: all, or of many the best verified."""
+    return np.argsort(-observation.objects.verification, kind="stable")[:MAX_OBJECTS]
+
+
+def gather_patches(points: np.ndarray, diameter: float) -> np.ndarray:
+    """The densest balls of unexplained points, one after the other.
+
+    Args:
+        points: (k, 3) metres.
+        diameter: of an object.
+
+    Returns:
+        (m, 3) middles of the patches.
+    """
+    thinning = max(1, -(-len(points) // _MOST_POINTS))
+    points = points[::thinning]
+    near = cdist(points, points) < _PATCH_RADIUS * diameter
+    middles, free = [], np.ones(len(points), bool)
+    while len(middles) < MAX_PATCHES and free.any():
+        count = near @ free.astype(np.float32) * free
+        members = near[count.argmax()] & free
+        if members.sum() * thinning < _FEWEST_POINTS:
+            break
+        middles.append(points[members].mean(axis=0))
+        free &= ~members
+    return np.reshape(middles, (-1, 3))
+
+
+def guess_middle(points: np.ndarray, patch: np.ndarray, model: ObjectModel) -> np.ndarray:
+    """Where the middle of an object is likely to be, given surface of it.
+
+    Every point about the patch votes for the places that are as far from it as an object's surface mostly is from its
+    middle; the answer is the mean of all places, weighted by how many agree on them (a Hough transform, softened).
+
+    Args:
+        points: (k, 3) unexplained surface, metres.
+        patch: (3,) middle of some of it.
+        model: of the object.
+    """
+    near = points[np.linalg.norm(points - patch, axis=1) < _VOTERS_WITHIN * model.diameter]
+    near = near[:: max(1, -(-len(near) // _MOST_VOTERS))]
+    places = patch + _PLACES * model.diameter
+    off_surface = (cdist(places, near) - _middle_radius(model)) / (_SHELL * model.diameter)
+    votes = np.exp(-0.5 * off_surface**2).mean(axis=1)
+    weight = np.exp(_SHARPNESS * (votes - votes.max()))
+    return weight @ places / weight.sum()
+
+
+@lru_cache(maxsize=16)
+def _middle_radius(model: ObjectModel) -> float:
+    """How far half of an object's surface is from its origin, metres."""
+    return float(np.median(np.linalg.norm(model_views(model).points, axis=1)))
+
+
+def represent(observation: Observation, model: ObjectModel, tray: Tray | None = None) -> SceneState:
+    """Everything that the network is told of an observation of objects in a tray, the usual one when None."""
+    objects, t = observation.objects, len(observation.positions)
+    best = best_verified(observation)
+    unexplained = observation.unexplained
+    patches = gather_patches(unexplained, model.diameter)
+    n, m = len(best), len(patches)
+    T_world_item = np.tile(np.eye(4), (n + m, 1, 1))
+    T_world_item[:n] = objects.T_world_object[best]
+    T_world_item[n:, :3, 3] = np.reshape([guess_middle(unexplained, patch, model) for patch in patches], (m, 3))
+    grid = observation.sphere.positions
+    eyes = np.concatenate([grid, observation.positions])
+    shares = expected_visibility(model).shares(T_world_item, eyes, tray or Tray.for_model(model), hiding=n)
+    pose, scalars = T_world_item[:, :3].astype(np.float32), np.zeros((n + m, 7), np.float32)
+    pose[n:, :, :3] = 0.0
+    axis = np.zeros(3) if model.symmetry.axis is None else model.symmetry.axis
+    columns = objects.verification, objects.score, objects.spread, objects.support / t
+    scalars[:n, :4] = np.column_stack(columns)[best]
+    scalars[n:, 4] = 1.0
+    apart = cdist(T_world_item[:, :3, 3], unexplained)
+    for column, within in enumerate(_NEAR_MIDDLE, start=5):
+        scalars[:, column] = (apart < within * model.diameter).sum(axis=1) / _POINTS_OF_ONE
+    return SceneState(
+        pose,
+        scalars,
+        shares[:, : len(grid)].astype(np.float32),
+        shares[:, len(grid) :].astype(np.float32),
+        observation.positions.astype(np.float32),
+        grid.astype(np.float32),
+        observation.steps_left,
+        float(model.diameter),
+        np.asarray(axis, np.float32),
+    )
+
+
+def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dict[str, torch.Tensor]:
+    """Padded tensors of B states of one object and one grid.
+
+    Args:
+        states: of any numbers of items and of views taken.
+        views: (M,) those in question, all of the grid when None.
+
+    Returns:
+        ``items`` (B, n, 18) and ``outlooks`` (B, M, 8) of the states; ``present`` (B, n), which items are no padding;
+        ``more`` (B,), whether moves are left after the next; ``pairs`` (B, M, n, 12) what is known of each item and
+        each view: the share that the view would show, how much that is above what was seen, how steeply the view
+        looks down on the item, the angle to the nearest view taken, its cosine, how much the views taken have seen from
+        that side, how far away the item is, whether the view is on the item's side of the bin, how far off the image's
+        centre the item is, and the direction to the view in the object's frame.
+    """
+    count = max(1, *(len(each.pose) for each in states))
+    some = slice(None) if views is None else views
+    grid = np.ascontiguousarray(states[0].grid[some], np.float32)
+    B, M = len(states), len(grid)
+    arrays = {
+        "items": np.zeros((B, count, ITEM_FEATURES), np.float32),
+        "outlooks": np.stack([each.outlooks[some] for each in states]),
+        "present": np.zeros((B, count), bool),
+        "more": np.array([each.left > 1 for each in states]),
+        "pairs": np.zeros((B, M, count, PAIR_FEATURES), np.float32),
+    }
+    for row, each in enumerate(states):
+        n = len(each.pose)
+        arrays["items"][row, :n], arrays["present"][row, :n] = each.items, True
+        shown = np.ascontiguousarray(each.shown[:, some])
+        _pair(each.pose, shown, each.seen, each.taken, grid, arrays["pairs"][row])
+    arrays["pairs"][..., -3:] = _sides(arrays["pairs"][..., -3:], states[0].axis)
+    return {name: torch.from_numpy(values) for name, values in arrays.items()}
+
+
+def _sides(directions: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """(..., 3) directions in the object's frame; about a symmetry axis only the angle to it counts."""
+    if not axis.any():
+        return directions
+    axial = directions @ axis
+    return np.stack([axial, np.sqrt(np.maximum(1 - axial**2, 0.0)), np.zeros_like(axial)], axis=-1)
+
+
+@compiled
+def _pair(
+    pose: np.ndarray, shown: np.ndarray, seen: np.ndarray, taken: np.ndarray, views: np.ndarray, pairs: np.ndarray
+) -> None:
+    """Fill one state's ``pairs`` of :func:`gather`; compiled, since it is a dozen numbers each."""
+    to_taken = np.empty(taken.shape, np.float32)
+    radius = _length(taken[-1, 0], taken[-1, 1], taken[-1, 2])
+    for item in range(len(pose)):
+        x0, y0, z0 = pose[item, 0, 3], pose[item, 1, 3], pose[item, 2, 3]
+        for index in range(len(to_taken)):
+            x, y, z = taken[index, 0] - x0, taken[index, 1] - y0, taken[index, 2] - z0
+            length = _length(x, y, z)
+            to_taken[index, 0], to_taken[index, 1], to_taken[index, 2] = x / length, y / length, z / length
+        from_axis, most = _length(x0, y0, np.float32(0)), seen[item].max()
+        for view in range(len(views)):
+            x, y, z = views[view, 0] - x0, views[view, 1] - y0, views[view, 2] - z0
+            length = _length(x, y, z)
+            distance = length / radius
+            x, y, z = x / length, y / length, z / length
+            closest, known = np.float32(-1), np.float32(0)
+            for index in range(len(to_taken)):
+                cosine = x * to_taken[index, 0] + y * to_taken[index, 1] + z * to_taken[index, 2]
+                closest = max(closest, cosine)
+                known = max(known, seen[item, index] * (np.float32(1) + cosine))
+            closest = min(closest, np.float32(1))
+            off_axis = x * views[view, 0] + y * views[view, 1] + z * views[view, 2]
+            off_axis /= _length(views[view, 0], views[view, 1], views[view, 2])
+            pair = pairs[view, item]
+            pair[0], pair[1], pair[2] = shown[item, view], shown[item, view] - most, z
+            # Just off the ends, where the angle has no derivative.
+            pair[3] = np.arccos(closest * np.float32(0.999999)) / np.float32(np.pi)
+            pair[4], pair[5], pair[6] = closest, known / np.float32(2), distance - np.float32(1)
+            pair[7], pair[8] = (x0 * x + y0 * y) / from_axis, off_axis - np.float32(0.95)
+            for axis in range(3):
+                pair[9 + axis] = x * pose[item, 0, axis] + y * pose[item, 1, axis] + z * pose[item, 2, axis]
+
+
+@compiled
+def _length(x: np.float32, y: np.float32, z: np.float32) -> np.float32:
+    """Of a vector in metres, a micrometre at the least: nothing has the direction of a zero."""
+    return max(np.sqrt(x * x + y * y + z * z), np.float32(1e-6))

@@ -1,0 +1,299 @@
+"""A policy that scores every view against the set of all objects: ``view-attention`` in the registry.
+
+A Gaussian over two angles cannot say "either of these two gaps". Here every view of the grid is valued by itself:
+it looks at all accumulated objects (cross-attention), and at the surface that none of them explains, through what a
+robot knows of each pair: how much of the object the view would show past the others and the bin's walls, from which
+side of the object it comes, how new that side is after the views already taken. The order and the number of objects do
+not matter.
+
+The network predicts what a view gains at once and what can still be gained after it. Training is in
+:mod:`active6d_agent.policies.view_attention.dagger`.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from active6d_agent.policies.policy_weights import load_weights, save_weights
+from active6d_agent.policies.registry import Decision, Observation, register_policy, weights_path
+from active6d_agent.policies.view_attention.features import (
+    ITEM_FEATURES,
+    PAIR_FEATURES,
+    VIEW_FEATURES,
+    SceneState,
+    best_verified,
+    gather,
+    represent,
+)
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.object_model import ObjectModel
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.scene.expected_visibility import Tray
+
+#: Gains are told as objects newly detected, and as the fall of the summed e_ADD over 50 mm.
+GAINS = 2
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """What counts.
+
+    Attributes:
+        metres_weight: objects that must be gained for a metre on the way.
+        error_weight: of the fall of the summed error over 50 mm, against one object detected.
+        lookahead: in [0, 1], weight of what the moves after the next will gain.
+
+    Raises:
+        ValueError: a weight is out of range.
+    """
+
+    metres_weight: float = 0.05
+    error_weight: float = 0.5
+    lookahead: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("metres_weight", "error_weight"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}, must be finite and not negative")
+        if not 0 <= self.lookahead <= 1:
+            raise ValueError(f"lookahead is {self.lookahead}, must be in [0, 1]")
+
+
+class _Seen(NamedTuple):
+    """What (M) views make of (n) objects."""
+
+    pairs: torch.Tensor
+    """(B, M, n, hidden), also of objects that are padding"""
+    total: torch.Tensor
+    """(B, M, hidden) sum over the objects"""
+    whole: torch.Tensor
+    """(B, M, 3 hidden + 8) the attended, the mean, and what is known of the view"""
+    attention: torch.Tensor
+    """(B, M, n)"""
+    mask: torch.Tensor
+    """(B, n) 1 for an object, 0 for padding"""
+
+
+class ViewAttention(nn.Module):
+    """Values of all views.
+
+    Args:
+        hidden: width.
+        weighing: what counted when it was validated.
+    """
+
+    def __init__(self, hidden: int = 32, weighing: Weighing = Weighing()) -> None:
+        super().__init__()
+        self.hidden, self.weighing = hidden, weighing
+        self.of_object = nn.Sequential(nn.Linear(ITEM_FEATURES, hidden), nn.ReLU())
+        self.in_context = nn.Sequential(nn.Linear(2 * hidden, hidden), nn.ReLU())
+        self.of_pair = nn.Linear(PAIR_FEATURES, hidden)
+        self.pair_from_object = nn.Linear(hidden, hidden, bias=False)
+        self.pair_from_view = nn.Linear(VIEW_FEATURES, hidden, bias=False)
+        self.mix = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU())
+        self.attend = nn.Linear(hidden, 1)
+        self.per_object = nn.Linear(hidden, 2 * GAINS)
+        self.per_view = nn.Sequential(
+            nn.Linear(3 * hidden + VIEW_FEATURES, hidden), nn.ReLU(), nn.Linear(hidden, 2 * GAINS)
+        )
+
+    def forward(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Value all views.
+
+        Args:
+            state: of :func:`~active6d_agent.policies.view_attention.features.gather`.
+
+        Returns:
+            (B, M, 2) gains of going there next; (B, M, 2) gains of the moves after that, zero where none are left;
+            (B, M, n) each view's attention to the objects.
+        """
+        seen = self._look(state)
+        # Gains of different objects add up, each a linear function of its features, so they are had from the sum of
+        # those. What nobody has seen yet is for the view as a whole to say.
+        bias = (seen.mask.sum(dim=1, keepdim=True) * self.per_object.bias)[:, None]
+        gains = seen.total @ self.per_object.weight.T + bias + self.per_view(seen.whole)
+        return gains[..., :GAINS], gains[..., GAINS:] * state["more"][:, None, None], seen.attention
+
+    def explain(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """What :meth:`forward` adds up, to learn from: twice (B, M, n + 1, 2), gains of going there next and of the
+        moves after that, of each object, and at the end of the view as a whole."""
+        seen = self._look(state)
+        own = self.per_object(seen.pairs) * seen.mask[:, None, :, None]
+        gains = torch.cat([own, self.per_view(seen.whole)[:, :, None]], dim=2)
+        return gains[..., :GAINS], gains[..., GAINS:] * state["more"][:, None, None, None]
+
+    def _look(self, state: dict[str, torch.Tensor]) -> "_Seen":
+        views = state["outlooks"]
+        h = self.of_object(state["items"])
+        mask = state["present"].to(h.dtype)
+        count = mask.sum(dim=1, keepdim=True).clamp(min=1)
+        pooled = (h * mask[..., None]).sum(dim=1) / count
+        h = self.in_context(torch.cat([h, pooled[:, None].expand_as(h)], dim=-1))
+        # Passes over (B, M, n, hidden) are what costs: sums are in place, and masks in the weights of sums.
+        e = self.of_pair(state["pairs"])
+        e += self.pair_from_object(h)[:, None]
+        e += self.pair_from_view(views)[:, :, None]
+        e = e.relu_()
+        e = e + self.mix(e)
+        logits = self.attend(e)[..., 0].masked_fill_(mask[:, None] == 0, -1e9)
+        attention = torch.softmax(logits, dim=-1) * mask[:, None]
+        attended, total = (torch.stack([attention, mask[:, None].expand_as(attention)], dim=2) @ e).unbind(dim=2)
+        whole = torch.cat([attended, total / count[..., None], pooled[:, None].expand_as(total), views], dim=-1)
+        return _Seen(e, total, whole, attention, mask)
+
+
+def save_network(network: ViewAttention, path: Path, object_name: str, provenance: dict | None = None) -> None:
+    """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
+    config = {"object": object_name, "hidden": network.hidden, "weighing": asdict(network.weighing)}
+    save_weights(network, path, "view-attention", config, provenance)
+
+
+def load_network(path: Path, object_name: str) -> ViewAttention:
+    """Read what :func:`save_network` wrote.
+
+    Raises:
+        ValueError: a file is missing, damaged, of another object or does not fit; the message names it.
+    """
+
+    def build(config: dict) -> ViewAttention:
+        if config["object"] != object_name:
+            raise ValueError(f"these are weights for '{config['object']}', not for '{object_name}'")
+        return ViewAttention(config["hidden"], Weighing(**config["weighing"]))
+
+    return load_weights(path, "view-attention", build)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewValues:
+    """Of B observations.
+
+    Attributes:
+        worth: (B, M) of going to each view next, ``-inf`` where it is no candidate.
+        gain: (B, M) expected of it and all later moves, ``-inf`` likewise.
+        attention: (B, M, n) of each view to the objects and patches.
+    """
+
+    worth: np.ndarray
+    gain: np.ndarray
+    attention: np.ndarray
+
+
+def value_views(
+    network: nn.Module, observations: Sequence[Observation], states: Sequence[SceneState], weighing: Weighing
+) -> ViewValues:
+    """Value every view of every observation, given its features (:func:`.features.represent`)."""
+    with torch.inference_mode():
+        now, later, attention = (values.double().numpy() for values in network(gather(states)))
+    candidates = np.stack([each.candidates() for each in observations])
+    arcs = np.stack([each.sphere.arc(each.sphere.positions, each.positions[-1]) for each in observations])
+    weigh = np.array([1.0, weighing.error_weight])
+    worth = (now + weighing.lookahead * later) @ weigh - weighing.metres_weight * arcs
+    # Views of equal value differ by rounding, which must not decide.
+    worth = np.where(candidates, np.round(worth, 5), -np.inf)
+    return ViewValues(worth, np.where(candidates, (now + later) @ weigh, -np.inf), attention)
+
+
+def trace(network: ViewAttention, model: ObjectModel) -> nn.Module:
+    """The same network without Python between its many small operations, for observations of any size."""
+    sphere = ViewSphere()
+    nothing = Observation(SceneObjects.empty(), sphere.positions[:1], sphere, np.ones(len(sphere), bool), 1)
+    state = gather([represent(nothing, model)])
+    with torch.inference_mode(), warnings.catch_warnings():
+        # torch calls tracing deprecated, but what shall replace it needs a compiler on the robot.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        traced = torch.jit.trace(network, (state,), strict=False, check_trace=False)
+        # The first two calls optimise it; no decision should wait for that.
+        for _ in range(2):
+            traced(state)
+    return traced
+
+
+@lru_cache(maxsize=8)
+def _deployed(path: Path, model: ObjectModel, written: int) -> tuple[nn.Module, Weighing]:
+    """The traced network of a file as it was ``written`` (ns), and its weighing; an evaluation makes hundreds of
+    policies, which share one."""
+    network = load_network(path, model.name)
+    return trace(network, model), network.weighing
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One observation is too little work to share: on a busy machine its threads wait for each other a hundred times
+    as long as they work. What else the process computes keeps its threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@register_policy("view-attention")
+class ViewAttentionPolicy:
+    """Goes to the view that is worth most: what it gains at once, plus what the moves after it are expected to gain,
+    less the way there.
+
+    Args:
+        model: names the shipped weights.
+        weights: path of other weights, ``""`` for the shipped ones.
+        metres_weight: see :class:`Weighing`; by default what the weights were validated with, as the next two.
+        error_weight: likewise.
+        lookahead: likewise.
+        stop_below: stop when this and all later moves are expected to gain less than this many objects; 0 never does.
+        bin_width: between the bin's inner walls, metres; by default that of the object's usual bin, as the next.
+        wall_height: of those walls above the floor, metres; 0 for an open table.
+
+    Raises:
+        ValueError: there are no usable weights, or a number is out of range.
+    """
+
+    def __init__(
+        self,
+        model: ObjectModel,
+        weights: str = "",
+        metres_weight: float | None = None,
+        error_weight: float | None = None,
+        lookahead: float | None = None,
+        stop_below: float = 0.0,
+        bin_width: float | None = None,
+        wall_height: float | None = None,
+    ) -> None:
+        path = Path(weights) if weights else weights_path("view-attention", model.name)
+        written = path.stat().st_mtime_ns if path.is_file() else 0
+        self._network, weighing = _deployed(path, model, written)
+        given = {"metres_weight": metres_weight, "error_weight": error_weight, "lookahead": lookahead}
+        given = {name: value for name, value in given.items() if value is not None}
+        self._model, self._weighing = model, replace(weighing, **given)
+        self._stop_below = stop_below
+        measured = {"width": bin_width, "wall_height": wall_height}
+        measured = {name: value for name, value in measured.items() if value is not None}
+        self._tray = Tray.for_model(model)._replace(**measured)
+        if not (0 < self._tray.width < np.inf and 0 <= self._tray.wall_height < np.inf):
+            raise ValueError(f"bin_width must be positive and wall_height not negative, got {self._tray}")
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing is random here."""
+
+    def decide(self, observation: Observation) -> Decision:
+        """The view of most worth, and the object that it attends to."""
+        with _one_thread():
+            state = represent(observation, self._model, self._tray)
+            values = value_views(self._network, [observation], [state], self._weighing)
+        most = values.gain[0].max()
+        if most == -np.inf or (self._stop_below > 0 and most < self._stop_below):
+            return Decision.stop_here(observation)
+        view = int(values.worth[0].argmax())
+        attention = np.zeros(len(observation.objects))
+        best = best_verified(observation)
+        attention[best] = values.attention[0, view, : len(best)]
+        if not attention.any():  # all of it is on surface that no object explains
+            return Decision.go_to(observation, view)
+        return Decision.go_to(observation, view, attention / attention.sum(), int(attention.argmax()))

@@ -1,0 +1,1 @@
+"""Episodes as rosbag2 folders: writer, reader and replay."""

@@ -1,0 +1,254 @@
+"""Reading a recorded episode back into the core's types. Needs the message classes of ROS, but no rclpy.
+
+The bag may be this project's own or any rosbag2 folder with the topics of the contract, under any one namespace.
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader, ReaderError
+
+from active6d_bringup.bags.writer import CAMERA_TOPICS, CONTRACT, END, POSE, START, TYPESTORE
+from active6d_core.camera import View
+from active6d_core.hypotheses import Hypotheses, SceneObjects
+from active6d_core.ros.conversions import (
+    MessageError,
+    attention_from_cloud,
+    hypotheses_from_cloud,
+    image_to_color,
+    image_to_depth,
+    image_to_segmentation,
+    info_to_camera,
+    latencies_from_diagnostics,
+    objects_from_cloud,
+    points_from_cloud,
+    pose_stamped_to_transform,
+    poses_from_array,
+    stamp_to_ns,
+)
+
+
+class BagError(ValueError):
+    """A bag that cannot be read as an episode; the text names the folder and says what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedStep:
+    """One view of an episode and what the graph made of it. What was not recorded is None.
+
+    Attributes:
+        view: the images, intrinsics and camera pose; ``view.stamp`` names the step.
+        hypotheses: of this view, in the camera's frame, with ``hypotheses.segmentation``.
+        objects: everything accumulated up to this view, in the world.
+        unexplained: (k, 3) places of the surface that is of none of the objects, in the world, metres.
+        attention: (n,) weight per object.
+        attended: index of the attended object.
+        goal: ``T_world_camera`` (4, 4) that the policy asked for next.
+        latency_ms: node name to the milliseconds it worked on this view.
+    """
+
+    view: View
+    hypotheses: Hypotheses | None = None
+    objects: SceneObjects | None = None
+    unexplained: np.ndarray | None = None
+    attention: np.ndarray | None = None
+    attended: int | None = None
+    goal: np.ndarray | None = None
+    latency_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def stamp(self) -> int:
+        """Nanoseconds."""
+        return self.view.stamp
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeRecord:
+    """A recorded episode.
+
+    Attributes:
+        folder: of the bag.
+        info: what the camera and the policy said of the episode (object, scene, split, seed, policy, ...).
+        steps: one per view, in order.
+        ground_truth: (n, 4, 4) ``T_world_object`` of the scene, None where the bag has none (a real camera).
+        end_reason: why the policy stopped, None if the recording was cut off before.
+        world_frame: name of the world's frame.
+    """
+
+    folder: Path
+    info: dict[str, str]
+    steps: list[RecordedStep]
+    ground_truth: np.ndarray | None
+    end_reason: str | None
+    world_frame: str
+
+    @property
+    def object(self) -> str | None:
+        """Name of the object."""
+        return self.info.get("object")
+
+    @property
+    def scene(self) -> str | None:
+        """Name of the scene."""
+        return self.info.get("scene")
+
+    @property
+    def seed(self) -> int | None:
+        """Seed of scene and sensor noise."""
+        text = self.info.get("seed", "")
+        return int(text) if text.lstrip("-").isdigit() else None
+
+    @property
+    def policy(self) -> str | None:
+        """Name of the policy."""
+        return self.info.get("policy")
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(t, 3) camera positions in the world, metres."""
+        return np.array([step.view.T_world_camera[:3, 3] for step in self.steps]).reshape(-1, 3)
+
+
+def read_episodes(folder: Path | str) -> list[EpisodeRecord]:
+    """Every episode of a bag, in order; a bag without ``episode/start`` is one episode.
+
+    Raises:
+        BagError: no bag, a broken one, or one without a complete view.
+    """
+    folder = Path(folder)
+    messages, latencies = _read_messages(folder)
+    try:
+        return _episodes(folder, messages, latencies)
+    except MessageError as error:
+        raise BagError(f"{folder}: {error}") from error
+
+
+def read_episode(folder: Path | str) -> EpisodeRecord:
+    """The first episode of a bag.
+
+    Raises:
+        BagError: no bag, a broken one, or one without a complete view.
+    """
+    return read_episodes(folder)[0]
+
+
+def open_bag(folder: Path) -> Reader:
+    """A rosbags reader for use in a ``with`` statement.
+
+    Raises:
+        BagError: no bag there, or one whose recording was cut off.
+    """
+    if not folder.is_dir():
+        raise BagError(f"{folder}: no such folder; name the folder of a bag, the one with metadata.yaml in it")
+    if not (folder / "metadata.yaml").is_file():
+        cut_off = any(folder.glob("*.mcap"))
+        hint = "its recording was killed; `mcap recover` saves what is there" if cut_off else "this is not a bag"
+        raise BagError(f"{folder}: no metadata.yaml; {hint}")
+    try:
+        return Reader(folder)
+    except (ReaderError, OSError) as error:
+        raise BagError(f"{folder}: {error}") from error
+
+
+def topic_names(connections: list[Connection], folder: Path) -> dict[str, str]:
+    """Recorded topic to its name in the contract, for the topics of the contract, whatever their namespace.
+
+    Raises:
+        BagError: the bag has no camera pose, or several (more than one namespace).
+    """
+    poses = sorted({connection.topic for connection in connections if connection.topic.endswith(f"/{POSE}")})
+    if len(poses) != 1:
+        found = f"several namespaces ({', '.join(poses)})" if poses else f"no topic {POSE}"
+        raise BagError(f"{folder}: has {found}; it is not an episode of active6d")
+    prefix = poses[0].removesuffix(POSE)
+    known = {topic.name if topic.name.startswith("/") else prefix + topic.name: topic for topic in CONTRACT}
+    wrong = [
+        connection
+        for connection in connections
+        if connection.topic in known and connection.msgtype != known[connection.topic].type
+    ]
+    if wrong:
+        expected = known[wrong[0].topic].type
+        raise BagError(f"{folder}: {wrong[0].topic} holds {wrong[0].msgtype}, expected {expected}")
+    return {name: topic.name for name, topic in known.items()}
+
+
+def _read_messages(folder: Path) -> tuple[dict[str, dict[int, Any]], dict[int, dict[str, float]]]:
+    """Topic and stamp to message (the last one of a stamp), and stamp and node to milliseconds."""
+    messages: dict[str, dict[int, Any]] = defaultdict(dict)
+    latencies: dict[int, dict[str, float]] = defaultdict(dict)
+    try:
+        with open_bag(folder) as reader:
+            names = topic_names(reader.connections, folder)
+            wanted = [connection for connection in reader.connections if connection.topic in names]
+            for connection, _, payload in reader.messages(wanted):
+                message = TYPESTORE.deserialize_cdr(payload, connection.msgtype)
+                topic = names[connection.topic]
+                if topic == "/diagnostics":
+                    latencies[stamp_to_ns(message.header.stamp)].update(latencies_from_diagnostics(message))
+                elif hasattr(message, "header"):
+                    messages[topic][stamp_to_ns(message.header.stamp)] = message
+    except BagError:
+        raise
+    # A damaged file fails anywhere in its decoding, with the error of whichever library was at work.
+    except Exception as error:
+        raise BagError(f"{folder}: damaged bag ({error})") from error
+    return messages, latencies
+
+
+def _episodes(folder: Path, messages: dict[str, dict[int, Any]], latencies: dict) -> list[EpisodeRecord]:
+    views = sorted(set.intersection(*(set(messages[topic.name]) for topic in CAMERA_TOPICS)))
+    if not views:
+        raise BagError(f"{folder}: holds no complete view (color, depth, camera_info and pose of one stamp)")
+    starts = [views[0], *(start for start in sorted(messages[START]) if views[0] < start <= views[-1])]
+    limits = [*starts[1:], views[-1] + 1]
+    return [_episode(folder, messages, latencies, *span, views) for span in zip(starts, limits, strict=True)]
+
+
+def _episode(folder: Path, messages: dict, latencies: dict, start: int, limit: int, views: list[int]) -> EpisodeRecord:
+    """The episode whose views have stamps in [start, limit)."""
+
+    def within(topic: str) -> list[Any]:
+        return [message for stamp, message in sorted(messages[topic].items()) if start <= stamp < limit]
+
+    world = messages[POSE][start].header.frame_id
+    truth, ends = within("ground_truth/poses"), within(END)
+    # The camera's word comes last: both sides say their seed, and the camera's is the one of the heap.
+    statuses = [status for message in (*ends, *within(START)) for status in message.status]
+    return EpisodeRecord(
+        folder=folder,
+        info={pair.key: pair.value for status in statuses for pair in status.values},
+        steps=[_step(messages, latencies.get(view, {}), view, world) for view in views if start <= view < limit],
+        ground_truth=poses_from_array(truth[-1], world) if truth else None,
+        end_reason=ends[-1].status[0].message if ends and ends[-1].status else None,
+        world_frame=world,
+    )
+
+
+def _step(messages: dict[str, dict[int, Any]], latency_ms: dict[str, float], stamp: int, world: str) -> RecordedStep:
+    at = {topic: by_stamp[stamp] for topic, by_stamp in messages.items() if stamp in by_stamp}
+    depth = at["camera/depth/image_raw"]
+    view = View(
+        stamp=stamp,
+        color=image_to_color(at["camera/color/image_raw"]),
+        depth=image_to_depth(depth),
+        camera=info_to_camera(at["camera/color/camera_info"]),
+        T_world_camera=pose_stamped_to_transform(at[POSE], world),
+    )
+    hypotheses = objects = unexplained = attention = attended = goal = None
+    if "hypotheses" in at and "hypotheses/segmentation" in at:
+        segmentation = image_to_segmentation(at["hypotheses/segmentation"])
+        hypotheses = hypotheses_from_cloud(at["hypotheses"], segmentation, depth.header.frame_id)
+    if "objects" in at:
+        objects = objects_from_cloud(at["objects"], world)
+    if "objects/unexplained" in at:
+        unexplained = points_from_cloud(at["objects/unexplained"], world)
+    if "attention" in at:
+        attention, attended = attention_from_cloud(at["attention"], world)
+    if "view_goal" in at:
+        goal = pose_stamped_to_transform(at["view_goal"], world)
+    return RecordedStep(view, hypotheses, objects, unexplained, attention, attended, goal, latency_ms)

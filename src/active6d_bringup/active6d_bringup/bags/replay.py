@@ -1,0 +1,258 @@
+"""A recorded episode's camera through live perception, and whether what comes out equals what was recorded."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image, PointCloud2
+
+from active6d_bringup.bags.reader import BagError, open_bag, read_episodes, topic_names
+from active6d_bringup.bags.writer import SETTINGS, TYPESTORE, stamp_of
+from active6d_bringup.graph.composition import GraphDescription, OnEvent, default_params_file, running
+from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
+
+#: What perception makes of a view, in the order in which it is made.
+COMPARED = {
+    "hypotheses": "sensor_msgs/msg/PointCloud2",
+    "hypotheses/segmentation": "sensor_msgs/msg/Image",
+    "objects": "sensor_msgs/msg/PointCloud2",
+    "objects/unexplained": "sensor_msgs/msg/PointCloud2",
+}
+_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+@dataclass(frozen=True)
+class ReplaySettings:
+    """What to replay, and how.
+
+    Attributes:
+        bag: folder of the bag.
+        rate: speed against the recording's; 0 sends a view when the objects of the last one have arrived.
+        object: name of the object, None for the one that the bag names.
+        estimator: name of the estimator, None for the recorded one.
+        processes: every node in a process of its own.
+        params_file: ROS parameters; None takes those of this package.
+        overrides: node name to parameters; they win over the file and over what was recorded.
+        domain: ROS domain, see ``GraphDescription``.
+        patience: seconds without an answer after which the replay counts as stuck.
+    """
+
+    bag: Path
+    rate: float = 0.0
+    object: str | None = None
+    estimator: str | None = None
+    processes: bool = False
+    params_file: Path | None = None
+    overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
+    domain: int | None = None
+    patience: float = 120.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One message against the recorded one of the same view.
+
+    Attributes:
+        stamp: of the view, nanoseconds.
+        topic: in ``COMPARED``.
+        recorded: rows (of a table) or pixels (of an image) in the bag, None where the bag has no such message.
+        live: the same of the live message.
+        equal: whether every byte agrees (CDR's padding aside, which has no meaning).
+        differences: column to the largest absolute difference, or to the share of pixels for an image; NaN where the
+            sizes differ.
+    """
+
+    stamp: int
+    topic: str
+    recorded: int | None
+    live: int
+    equal: bool
+    differences: dict[str, float]
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """What a replay gave.
+
+    Attributes:
+        views: number of views replayed.
+        comparisons: one per view and topic of ``COMPARED``.
+        seconds: of wall-clock time from the first view to the last objects.
+    """
+
+    views: int
+    comparisons: list[Comparison]
+    seconds: float
+
+    @property
+    def equal(self) -> bool:
+        """Whether every message equals the recorded one."""
+        return bool(self.comparisons) and all(comparison.equal for comparison in self.comparisons)
+
+    def largest_differences(self) -> dict[str, float]:
+        """``topic.column`` to the largest difference over all views, of those that differ."""
+        largest: dict[str, float] = {}
+        for comparison in self.comparisons:
+            for column, difference in comparison.differences.items():
+                name = f"{comparison.topic}.{column}"
+                largest[name] = float(np.maximum(difference, largest.get(name, 0.0)))
+        return largest
+
+
+def replay(
+    settings: ReplaySettings,
+    on_view: Callable[[int, int], None] = lambda done, total: None,
+    on_event: OnEvent = lambda text: None,
+) -> ReplayResult:
+    """Send a bag's camera through live perception and compare.
+
+    Args:
+        settings: what to replay.
+        on_view: called with the number of views answered so far, and of all.
+        on_event: called with what happens to the nodes, in words.
+
+    Raises:
+        BagError: the bag cannot be read, or does not name its object.
+        ValueError: a setting or a parameter is wrong; the message names it.
+        EpisodeError: perception does not answer.
+        EpisodeInterrupted: by Ctrl-C or SIGTERM.
+    """
+    episodes = read_episodes(settings.bag)
+    stamps = [step.stamp for episode in episodes for step in episode.steps]
+    recorded = _read_compared(settings.bag)
+    description = describe(settings, episodes[0].object)
+    with interruptible() as interrupted, running(make_graph(settings, description, on_event)) as graph:
+        listener = _Listener(graph.context)
+        graph.add(listener)
+        started = time.monotonic()
+        graph.start()
+        answered, deadline = -1, 0.0
+        while len(listener.answered(stamps)) < len(stamps):
+            if interrupted.is_set():
+                raise EpisodeInterrupted
+            if answered != len(listener.answered(stamps)):
+                answered, deadline = len(listener.answered(stamps)), time.monotonic() + settings.patience
+                on_view(answered, len(stamps))
+            elif time.monotonic() > deadline:
+                raise EpisodeError(f"no objects of view {answered + 1} of {len(stamps)} in {settings.patience:.0f} s")
+            graph.spin_once(0.1)
+        seconds = time.monotonic() - started
+        on_view(len(stamps), len(stamps))
+    comparisons = [
+        compare(stamp, topic, recorded.get((topic, stamp)), listener.payloads[topic, stamp])
+        for stamp in stamps
+        for topic in COMPARED
+    ]
+    return ReplayResult(len(stamps), comparisons, seconds)
+
+
+def describe(settings: ReplaySettings, recorded_object: str | None) -> GraphDescription:
+    """The graph of a replay: a player in the camera's place, and perception as it was told when recording.
+
+    Raises:
+        BagError: neither the settings nor the bag name the object.
+    """
+    name = settings.object or recorded_object
+    if name is None:
+        raise BagError(f"{settings.bag}: does not name its object; say which it is with --object")
+    told = _read_settings(settings.bag)
+    estimator = {**told.get("pose_estimator", {}), "object": name}
+    if settings.estimator is not None:
+        estimator["estimator"] = settings.estimator
+    nodes = {
+        "bag_player": {"bag": str(settings.bag), "rate": float(settings.rate)},
+        "pose_estimator": estimator,
+        "hypothesis_fusion": {**told.get("hypothesis_fusion", {}), "object": name},
+    }
+    nodes = {name: {**parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
+    return GraphDescription(nodes, settings.params_file or default_params_file(), domain=settings.domain)
+
+
+def compare(stamp: int, topic: str, recorded: bytes | None, live: bytes) -> Comparison:
+    """Compare the serialized messages of one view and topic."""
+    message_type = COMPARED[topic]
+    found = TYPESTORE.deserialize_cdr(live, message_type)
+    size = found.width * found.height
+    if recorded is None:
+        return Comparison(stamp, topic, None, size, False, {})
+    expected = TYPESTORE.deserialize_cdr(recorded, message_type)
+    equal = TYPESTORE.serialize_cdr(found, message_type) == TYPESTORE.serialize_cdr(expected, message_type)
+    differences = {} if equal else _differences(expected, found)
+    return Comparison(stamp, topic, expected.width * expected.height, size, equal, differences)
+
+
+def _differences(expected: Any, found: Any) -> dict[str, float]:
+    if len(expected.data) != len(found.data):
+        return {"size": float("nan")}
+    if hasattr(expected, "encoding"):
+        wrong = (expected.data != found.data).reshape(expected.height * expected.width, -1).any(axis=1)
+        return {"pixels": float(wrong.mean())}
+    tables = [_table(message) for message in (expected, found)]
+    if tables[0].dtype != tables[1].dtype:
+        return {"columns": float("nan")}
+    largest = {
+        name: np.abs(tables[0][name].astype(float) - tables[1][name]).max(initial=0.0) for name in tables[0].dtype.names
+    }
+    return {name: float(difference) for name, difference in largest.items() if difference != 0}
+
+
+def _table(message: Any) -> np.ndarray:
+    layout = {
+        "names": [column.name for column in message.fields],
+        "formats": [f"<{_DTYPES[column.datatype]}" for column in message.fields],
+        "offsets": [column.offset for column in message.fields],
+        "itemsize": message.point_step,
+    }
+    return np.frombuffer(message.data.tobytes(), np.dtype(layout))
+
+
+def _read_settings(folder: Path) -> dict[str, dict[str, Any]]:
+    """What the nodes were told when recording; nothing where the bag's metadata does not say."""
+    metadata = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    try:
+        settings = json.loads((metadata.get("custom_data") or {})[SETTINGS])
+    except (KeyError, TypeError, json.JSONDecodeError):
+        return {}
+    if not isinstance(settings, dict):
+        return {}
+    return {node: parameters for node, parameters in settings.items() if isinstance(parameters, dict)}
+
+
+def _read_compared(folder: Path) -> dict[tuple[str, int], bytes]:
+    """(topic, stamp) to the recorded payload, the last one of a stamp."""
+    payloads = {}
+    with open_bag(folder) as reader:
+        names = topic_names(reader.connections, folder)
+        wanted = [connection for connection in reader.connections if names.get(connection.topic) in COMPARED]
+        for connection, _, payload in reader.messages(wanted):
+            topic = names[connection.topic]
+            payloads[topic, stamp_of(connection.msgtype, payload)] = bytes(payload)
+    return payloads
+
+
+class _Listener(Node):
+    """Keeps what perception says, serialized."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__("replay_listener", context=context, start_parameter_services=False, enable_rosout=False)
+        self.payloads: dict[tuple[str, int], bytes] = {}
+        qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        for topic, message_type in COMPARED.items():
+
+            def keep(payload: bytes, topic: str = topic, message_type: str = message_type) -> None:
+                self.payloads[topic, stamp_of(message_type, payload)] = payload
+
+            kind = Image if message_type.endswith("Image") else PointCloud2
+            self.create_subscription(kind, topic, keep, qos, raw=True)
+
+    def answered(self, stamps: list[int]) -> list[int]:
+        """The views for which everything that is compared has arrived."""
+        return [stamp for stamp in stamps if all((topic, stamp) in self.payloads for topic in COMPARED)]

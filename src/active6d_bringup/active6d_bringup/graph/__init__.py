@@ -1,0 +1,1 @@
+"""The node graph: in one process, as supervised processes, and one episode of it."""

@@ -1,0 +1,186 @@
+"""Which nodes make the graph, and how they run together in one process on one executor."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+
+#: Node name to its module and class. Their order is the order of starting: who listens comes before who speaks.
+NODES = {
+    "episode_recorder": ("active6d_bringup.nodes.episode_recorder", "EpisodeRecorderNode"),
+    "attention_policy": ("active6d_agent.nodes.attention_policy", "AttentionPolicyNode"),
+    "hypothesis_fusion": ("active6d_perception.nodes.hypothesis_fusion", "HypothesisFusionNode"),
+    "pose_estimator": ("active6d_perception.nodes.pose_estimator", "PoseEstimatorNode"),
+    "bag_player": ("active6d_bringup.nodes.bag_player", "BagPlayerNode"),
+    "dataset_camera": ("active6d_sim.nodes.dataset_camera", "DatasetCameraNode"),
+    "camera_simulator": ("active6d_sim.nodes.camera_simulator", "CameraSimulatorNode"),
+}
+
+OnEvent = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class GraphDescription:
+    """The nodes to run and what they are told.
+
+    Attributes:
+        nodes: names in ``NODES``, each with the parameters that override the file's.
+        params_file: ROS parameters YAML for all of them; None leaves the nodes' own defaults.
+        namespace: of all topics and nodes.
+        domain: ROS domain; None takes ``ROS_DOMAIN_ID`` or, without it, one of this process's own, so that episodes
+            that run side by side do not talk to each other.
+    """
+
+    nodes: dict[str, dict[str, Any]]
+    params_file: Path | None = None
+    namespace: str = ""
+    domain: int | None = None
+    log_level: str = field(default="warn", kw_only=True)
+
+    def __post_init__(self) -> None:
+        unknown = self.nodes.keys() - NODES.keys()
+        if unknown:
+            raise ValueError(f"unknown node '{min(unknown)}'; known: {', '.join(NODES)}")
+        if self.params_file is not None and not self.params_file.is_file():
+            raise ValueError(f"params file {self.params_file} does not exist")
+
+    def in_order(self) -> list[str]:
+        """The nodes' names in the order of starting."""
+        return [name for name in NODES if name in self.nodes]
+
+    def ros_arguments(self) -> list[str]:
+        """What the description says to every node alike, as ROS command line arguments."""
+        parameters = ["--params-file", str(self.params_file)] if self.params_file else []
+        return ["--ros-args", "--log-level", self.log_level, *parameters]
+
+    def domain_id(self) -> int:
+        """The domain that the graph runs in."""
+        if self.domain is not None:
+            return self.domain
+        # DDS derives ports from the domain; those above 101 collide with the ones Linux hands out.
+        return int(os.environ.get("ROS_DOMAIN_ID") or 1 + os.getpid() % 101)
+
+
+class Graph(Protocol):
+    """A running graph, whatever its processes."""
+
+    context: Context
+    restarted: list[str]
+    """nodes that died and were started again, in order"""
+
+    def add(self, node: Node) -> None:
+        """Spin one more node of the caller's in this process."""
+
+    def start(self) -> None:
+        """Bring all nodes to life."""
+
+    def spin_once(self, timeout: float) -> None:
+        """Run at most one callback of this process, waiting for it at most ``timeout`` seconds."""
+
+    def missing(self, stamp: int) -> list[str]:
+        """Topics that the recorder, if any, still waits for to have the episode that ends at ``stamp`` in full."""
+
+    def close(self) -> None:
+        """End all nodes; a recorded bag is complete and readable afterwards."""
+
+
+class ComposedGraph:
+    """All nodes in this process, one executor, no threads of our own.
+
+    Raises:
+        ValueError: a parameter is wrong; the message names node and parameter.
+    """
+
+    def __init__(self, description: GraphDescription, on_event: OnEvent = lambda text: None) -> None:
+        self._description = description
+        self._on_event = on_event
+        self.context = open_context(description)
+        self.executor = EventsExecutor(context=self.context)
+        self.nodes: dict[str, Node] = {}
+        self.restarted: list[str] = []
+        self._guests: list[Node] = []
+
+    def add(self, node: Node) -> None:
+        """Spin one more node of the caller's; it is destroyed with the graph."""
+        self._guests.append(node)
+        self.executor.add_node(node)
+
+    def start(self) -> None:
+        """Make all nodes before any of them speaks, then start them one after the other."""
+        for name in self._description.in_order():
+            node_type = load_node_type(name)
+            self.nodes[name] = node_type(
+                context=self.context,
+                namespace=self._description.namespace,
+                overrides=self._description.nodes[name],
+            )
+            self.executor.add_node(self.nodes[name])
+        for name, node in self.nodes.items():
+            self._on_event(f"starting {name}")
+            node.start()
+
+    def spin_once(self, timeout: float) -> None:
+        """Run one callback; what it raises is raised here."""
+        self.executor.spin_once(timeout_sec=timeout)
+
+    def missing(self, stamp: int) -> list[str]:
+        """What the recorder, if there is one, still waits for."""
+        recorder = self.nodes.get("episode_recorder")
+        return recorder.missing(stamp) if recorder else []
+
+    def close(self) -> None:
+        """Destroy all nodes."""
+        for node in [*self._guests, *reversed(self.nodes.values())]:
+            self.executor.remove_node(node)
+            node.destroy_node()
+        self.executor.shutdown()
+        self.context.try_shutdown()
+
+
+def load_node_type(name: str) -> type[Node]:
+    """The class of a node in ``NODES``."""
+    module, node_type = NODES[name]
+    return getattr(import_module(module), node_type)
+
+
+def open_context(description: GraphDescription) -> Context:
+    """A context in the description's domain that passes its parameter file to every node.
+
+    Raises:
+        ValueError: the parameter file cannot be parsed.
+    """
+    context = Context()
+    try:
+        context.init(args=description.ros_arguments(), domain_id=description.domain_id())
+    except RuntimeError as error:
+        raise ValueError(f"params file {description.params_file}: {error}") from error
+    return context
+
+
+@contextmanager
+def running(graph: Graph) -> Iterator[Graph]:
+    """The graph, closed on every way out."""
+    try:
+        yield graph
+    finally:
+        graph.close()
+
+
+def default_params_file() -> Path | None:
+    """The parameters that ship with this package: in the source tree, else in its installed share folder."""
+    source = Path(__file__).parents[2] / "config" / "active6d.yaml"
+    if source.is_file():
+        return source
+    try:
+        installed = Path(get_package_share_directory("active6d_bringup")) / "config" / "active6d.yaml"
+    except PackageNotFoundError:
+        return None
+    return installed if installed.is_file() else None

@@ -1,0 +1,398 @@
+"""One episode from its settings to its result: bring up the graph, watch it, end it when all is on record."""
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseArray, PoseStamped
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2
+
+from active6d_bringup.bags.writer import RecordingError, describe_missing
+from active6d_bringup.graph.composition import (
+    ComposedGraph,
+    Graph,
+    GraphDescription,
+    OnEvent,
+    default_params_file,
+    running,
+)
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.ros.conversions import (
+    latencies_from_diagnostics,
+    objects_from_cloud,
+    pose_stamped_to_transform,
+    poses_from_array,
+    stamp_to_ns,
+)
+from active6d_core.view_sphere import ViewSphere
+
+#: How long a recorder may lag behind the end of an episode in which a node died.
+_SETTLE_SECONDS = 5.0
+
+
+class EpisodeError(RuntimeError):
+    """An episode that did not come to its end; the text says which node has not answered."""
+
+
+class EpisodeInterrupted(KeyboardInterrupt):
+    """Somebody pressed Ctrl-C (or sent SIGTERM); the bag is closed and readable."""
+
+
+@dataclass(frozen=True)
+class EpisodeSettings:
+    """What to run.
+
+    Attributes:
+        object: name of the object that fills the bin.
+        seed: of the heap, the sensor noise and the policy.
+        scene: a stored scene such as ``mug/test/3`` in place of a heap dropped by ``seed``.
+        policy: name of the policy.
+        steps: budget of moves T.
+        metres: budget of metres along the hemisphere, None without one.
+        estimator: name of the estimator, None for the params file's.
+        bag: folder to create for the recording, None for no recording.
+        processes: every node in a process of its own.
+        params_file: ROS parameters; None takes those of this package.
+        overrides: node name to parameters; they win over the file and over the settings above.
+        namespace: of all topics and nodes.
+        domain: ROS domain, see ``GraphDescription``.
+        patience: seconds without progress after which the episode counts as stuck. It decides no result.
+    """
+
+    object: str = "mug"
+    seed: int = 0
+    scene: str | None = None
+    policy: str = "auto"
+    steps: int = 5
+    metres: float | None = None
+    estimator: str | None = None
+    bag: Path | None = None
+    processes: bool = False
+    params_file: Path | None = None
+    overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
+    namespace: str = ""
+    domain: int | None = None
+    patience: float = 120.0
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeStep:
+    """One view as the graph reported it.
+
+    Attributes:
+        index: 0 for the view before any move.
+        stamp: nanoseconds.
+        T_world_camera: (4, 4).
+        distance: metres of arc since the first view.
+        hypotheses: how many the estimator had for this view alone.
+        objects: everything accumulated up to this view.
+        ground_truth: (n, 4, 4) ``T_world_object`` if the camera has told, for scoring.
+        goal: ``T_world_camera`` (4, 4) that the policy asked for next; None for the last view.
+        latency_ms: node name to the milliseconds it worked on this view.
+    """
+
+    index: int
+    stamp: int
+    T_world_camera: np.ndarray
+    distance: float
+    hypotheses: int
+    objects: SceneObjects
+    ground_truth: np.ndarray | None
+    goal: np.ndarray | None
+    latency_ms: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeResult:
+    """An episode that came to its end.
+
+    Attributes:
+        settings: what was asked for.
+        info: what the camera and the policy said of the episode (object, scene, seed, policy, ...).
+        steps: one per view.
+        ground_truth: (n, 4, 4) ``T_world_object`` if the camera knows it.
+        reason: why the policy stopped.
+        distance: metres of arc that the camera travelled.
+        seconds: of wall-clock time from the first view to the end.
+        events: what happened to the nodes, such as a restart.
+    """
+
+    settings: EpisodeSettings
+    info: dict[str, str]
+    steps: list[EpisodeStep]
+    ground_truth: np.ndarray | None
+    reason: str
+    distance: float
+    seconds: float
+    events: list[str]
+
+    @property
+    def objects(self) -> SceneObjects:
+        """What was found in the end."""
+        return self.steps[-1].objects
+
+
+OnStep = Callable[[EpisodeStep], None]
+
+
+def run_episode(
+    settings: EpisodeSettings, on_step: OnStep = lambda step: None, on_event: OnEvent = lambda text: None
+) -> EpisodeResult:
+    """Run one episode and record it if the settings name a bag.
+
+    Args:
+        settings: what to run.
+        on_step: called with every view as soon as its objects are known (its goal is not, yet).
+        on_event: called with what happens to the nodes, in words.
+
+    Raises:
+        ValueError: a setting or a parameter is wrong; the message names it.
+        EpisodeError: a node does not answer.
+        EpisodeInterrupted: by Ctrl-C or SIGTERM.
+    """
+    # The recorder would find out too, but only after the other nodes' heavy start.
+    if settings.bag is not None and settings.bag.exists():
+        raise RecordingError(f"{settings.bag} exists already; name a new folder for the bag or remove this one")
+    events: list[str] = []
+
+    def note(text: str) -> None:
+        events.append(text)
+        on_event(text)
+
+    with interruptible() as interrupted, running(make_graph(settings, describe(settings), note)) as graph:
+        monitor = EpisodeMonitor(graph.context, settings.namespace, on_step)
+        graph.add(monitor)
+        graph.start()
+        _spin_to_end(graph, monitor, settings.patience, interrupted, note)
+        return monitor.result(settings, events)
+
+
+def describe(settings: EpisodeSettings) -> GraphDescription:
+    """The graph of an episode, each node with its parameters."""
+    camera = {"object": settings.object, "seed": settings.seed}
+    if settings.scene is not None:
+        camera["scene"] = settings.scene
+    policy = {"object": settings.object, "seed": settings.seed, "policy": settings.policy, "steps": settings.steps}
+    if settings.metres is not None:
+        policy["metres"] = float(settings.metres)
+    estimator = {"object": settings.object}
+    if settings.estimator is not None:
+        estimator["estimator"] = settings.estimator
+    nodes = {
+        "camera_simulator": camera,
+        "pose_estimator": estimator,
+        "hypothesis_fusion": {"object": settings.object},
+        "attention_policy": policy,
+    }
+    if settings.bag is not None:
+        nodes["episode_recorder"] = {"bag": str(settings.bag)}
+    unknown = settings.overrides.keys() - nodes.keys()
+    if unknown:
+        raise ValueError(f"no node '{min(unknown)}' in an episode; there are {', '.join(nodes)}")
+    nodes = {name: {**parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
+    if settings.bag is not None:
+        nodes["episode_recorder"]["settings"] = json.dumps(nodes)
+    return GraphDescription(nodes, settings.params_file or default_params_file(), settings.namespace, settings.domain)
+
+
+def make_graph(settings: Any, description: GraphDescription, on_event: OnEvent) -> Graph:
+    """The described graph, in this process or in one process a node as the settings say; not started yet."""
+    if settings.processes:
+        from active6d_bringup.graph.processes import ProcessGraph
+
+        return ProcessGraph(description, on_event, settings.patience)
+    return ComposedGraph(description, on_event)
+
+
+@contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set, so that neither breaks into a write; a second Ctrl-C does.
+
+    In a thread other than the main one, signals stay as they are.
+    """
+    interrupted = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupted
+        return
+
+    def interrupt(number: int, frame: Any) -> None:
+        if interrupted.is_set():
+            raise EpisodeInterrupted
+        interrupted.set()
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _spin_to_end(
+    graph: Graph, monitor: "EpisodeMonitor", patience: float, interrupted: threading.Event, note: OnEvent
+) -> None:
+    progress, since = None, 0.0
+    while True:
+        if interrupted.is_set():
+            raise EpisodeInterrupted
+        awaited = monitor.missing()
+        unrecorded = [] if awaited else graph.missing(monitor.last)
+        if not awaited and not unrecorded:
+            return
+        if progress != (monitor.received, monitor.end_stamp):
+            progress, since = (monitor.received, monitor.end_stamp), time.monotonic()
+        idle = time.monotonic() - since
+        if not awaited and graph.restarted and idle > _SETTLE_SECONDS:
+            # Whoever is killed while it speaks is not heard by all: the episode went on, the recorder missed a word.
+            note(f"the bag is not complete: no answer from {describe_missing(unrecorded)}")
+            return
+        if idle > patience:
+            silent = f"no progress for {patience:.0f} s: no answer from {describe_missing(awaited or unrecorded)}"
+            raise EpisodeError("; ".join([silent, *monitor.last_refusal]))
+        graph.spin_once(0.1)
+
+
+class EpisodeMonitor(Node):
+    """Listens to an episode and keeps what its result needs."""
+
+    def __init__(self, context: Context, namespace: str, on_step: OnStep) -> None:
+        super().__init__(
+            "episode_monitor", context=context, namespace=namespace, start_parameter_services=False, enable_rosout=False
+        )
+        self.received = 0
+        self.end_stamp: int | None = None
+        #: What a node last refused and why, in words; empty if none did.
+        self.last_refusal: list[str] = []
+        self._on_step = on_step
+        self._reported: set[int] = set()
+        self._poses: dict[int, np.ndarray] = {}
+        self._objects: dict[int, SceneObjects] = {}
+        self._goals: dict[int, np.ndarray] = {}
+        self._hypotheses: dict[int, int] = {}
+        self._latencies: dict[int, dict[str, float]] = {}
+        self._ground_truth: np.ndarray | None = None
+        self._info: dict[str, str] = {}
+        self._reason = ""
+        self._began = self._ended = 0.0
+        self._listen(PoseStamped, "camera/pose", self._on_pose, latched=True)
+        self._listen(PointCloud2, "hypotheses", self._on_hypotheses)
+        self._listen(PointCloud2, "objects", self._on_objects)
+        self._listen(PoseStamped, "view_goal", self._on_goal)
+        self._listen(PoseArray, "ground_truth/poses", self._on_ground_truth, latched=True)
+        self._listen(DiagnosticArray, "episode/start", self._on_start, latched=True)
+        self._listen(DiagnosticArray, "episode/end", self._on_end, latched=True)
+        self._listen(DiagnosticArray, "/diagnostics", self._on_diagnostics)
+
+    @property
+    def last(self) -> int:
+        """Stamp in nanoseconds of the last view so far, 0 before the first."""
+        return max(self._poses, default=0)
+
+    def missing(self) -> list[str]:
+        """The topic that the episode waits for next; nothing when it has ended."""
+        view = self.last
+        if self.end_stamp is not None and self.end_stamp == view and view in self._objects:
+            return []
+        # A goal whose view does not come was refused or is under way: either way it is the camera's turn.
+        if not view or view in self._goals:
+            return ["camera/pose"]
+        if view not in self._hypotheses:
+            return ["hypotheses"]
+        return ["view_goal"] if view in self._objects else ["objects"]
+
+    def result(self, settings: EpisodeSettings, events: list[str]) -> EpisodeResult:
+        """What has been heard of the episode, which must have ended."""
+        steps = [self._step(index, stamp) for index, stamp in enumerate(sorted(self._poses.keys() & self._objects))]
+        return EpisodeResult(
+            settings=settings,
+            info=self._info,
+            steps=steps,
+            ground_truth=self._ground_truth,
+            reason=self._reason,
+            distance=steps[-1].distance,
+            seconds=self._ended - self._began,
+            events=events,
+        )
+
+    def _listen(self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool = False) -> None:
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+        def heard(message: Any) -> None:
+            callback(message)
+            self.received += topic != "/diagnostics"
+            self._report_steps()
+
+        self.create_subscription(message_type, topic, heard, qos)
+
+    def _report_steps(self) -> None:
+        for index, stamp in enumerate(sorted(self._poses.keys() & self._objects)):
+            if stamp not in self._reported:
+                self._reported.add(stamp)
+                self._on_step(self._step(index, stamp))
+
+    def _step(self, index: int, stamp: int) -> EpisodeStep:
+        return EpisodeStep(
+            index,
+            stamp,
+            self._poses[stamp],
+            self._distance(stamp),
+            self._hypotheses.get(stamp, 0),
+            self._objects[stamp],
+            self._ground_truth,
+            self._goals.get(stamp),
+            self._latencies.get(stamp, {}),
+        )
+
+    def _distance(self, stamp: int) -> float:
+        positions = np.array([T[:3, 3] for at, T in sorted(self._poses.items()) if at <= stamp])
+        return ViewSphere(radius=float(np.linalg.norm(positions[0]))).path_length(positions)
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        if not self._poses:
+            self._began = time.monotonic()
+        self._poses[stamp_to_ns(message.header.stamp)] = pose_stamped_to_transform(message, message.header.frame_id)
+
+    def _on_hypotheses(self, message: PointCloud2) -> None:
+        self._hypotheses[stamp_to_ns(message.header.stamp)] = message.width * message.height
+
+    def _on_objects(self, message: PointCloud2) -> None:
+        self._objects[stamp_to_ns(message.header.stamp)] = objects_from_cloud(message, message.header.frame_id)
+
+    def _on_goal(self, message: PoseStamped) -> None:
+        self._goals[stamp_to_ns(message.header.stamp)] = pose_stamped_to_transform(message, message.header.frame_id)
+
+    def _on_ground_truth(self, message: PoseArray) -> None:
+        self._ground_truth = poses_from_array(message, message.header.frame_id)
+
+    def _on_start(self, message: DiagnosticArray) -> None:
+        self._info.update(_values(message))
+
+    def _on_end(self, message: DiagnosticArray) -> None:
+        # Both sides say their seed; the camera's is the one of the heap.
+        self._info = {**_values(message), **self._info}
+        self.end_stamp = stamp_to_ns(message.header.stamp)
+        self._reason = message.status[0].message if message.status else ""
+        self._ended = time.monotonic()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.level == DiagnosticStatus.ERROR:
+                self.last_refusal = [f"{status.name} refused {status.message}"]
+        latencies = latencies_from_diagnostics(message)
+        self._latencies.setdefault(stamp_to_ns(message.header.stamp), {}).update(latencies)
+
+
+def _values(message: DiagnosticArray) -> dict[str, str]:
+    return {pair.key: pair.value for status in message.status for pair in status.values}

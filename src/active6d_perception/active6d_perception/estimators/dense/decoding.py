@@ -1,0 +1,172 @@
+"""From the network's answer to poses: instances from votes, a robust rigid fit for each, the turn about the axis."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit, log_softmax, softmax
+
+from active6d_core.camera import PinholeCamera, pixel_rays
+from active6d_core.se3 import make_transform
+from active6d_perception.estimators.dense.canonical_frame import (
+    TURNS,
+    AxisRotation,
+    CanonicalFrame,
+    facing_camera,
+    rotation_about_z,
+)
+from active6d_perception.estimators.dense.network import split
+from active6d_perception.estimators.dense.network_input import ray_frames, ray_rotation
+from active6d_perception.estimators.dense.rigid_fit import robust_fit
+from active6d_perception.estimators.dense.sphere_bins import density
+from active6d_perception.estimators.dense.votes import cluster_votes
+
+
+@dataclass(frozen=True)
+class DecodingParameters:
+    """Thresholds of decoding; lengths in diameters.
+
+    Attributes:
+        mask_threshold: probability above which a pixel belongs to an object.
+        pixels: most pixels per instance that take part in the fit.
+        fewest_pixels: an instance with fewer is dropped.
+        tolerance: residual of a correspondence that counts half.
+        coordinates: fit object coordinates to points; otherwise poses come from the votes for centre and axis alone.
+    """
+
+    mask_threshold: float = 0.5
+    pixels: int = 160
+    fewest_pixels: int = 12
+    tolerance: float = 0.05
+    coordinates: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Instances:
+    """n instances that the network's answer shows, p pixels in all.
+
+    Attributes:
+        pixel: (p,) flat indices into the answer's image.
+        label: (p,) index of each pixel's instance.
+        T_camera_axis: (n, 4, 4) pose of the axis frame. Centre and axis are voted for; its turn is the likeliest one
+            where every turn looks different, elsewhere the one that faces the camera.
+        direction: (n, DIRECTION_BINS) distribution of the axis frame's x, in the frame of the ray through its origin.
+    """
+
+    pixel: np.ndarray
+    label: np.ndarray
+    T_camera_axis: np.ndarray
+    direction: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.T_camera_axis)
+
+
+def decode(
+    answer: np.ndarray,
+    depth: np.ndarray,
+    camera: PinholeCamera,
+    canonical_frame: CanonicalFrame,
+    diameter: float,
+    parameters: DecodingParameters = DecodingParameters(),
+) -> Instances:
+    """Instances and their poses.
+
+    Args:
+        answer: (channels, h, w) of the network.
+        depth: (h, w) metres at that resolution, NaN where invalid.
+        camera: intrinsics of both.
+        canonical_frame: that the network was trained with.
+        diameter: of the object, metres.
+        parameters: thresholds.
+    """
+    probability = expit(answer[0])
+    pixel = np.flatnonzero((probability > parameters.mask_threshold) & np.isfinite(depth))
+    # Channels last, as the network answers, this is a view and each pixel's answer is together.
+    parts = split(np.moveaxis(answer, 0, -1).reshape(-1, len(answer))[pixel])
+    points = pixel_rays(camera).reshape(-1, 3)[pixel] * depth.ravel()[pixel, None]
+    votes = points + diameter * np.einsum("pij,pj->pi", ray_frames(camera).reshape(-1, 3, 3)[pixel], parts["centre"])
+    weight = np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))
+    clusters = cluster_votes(votes, weight, diameter, parameters.fewest_pixels)
+    member = clusters.label >= 0
+    label, pixel, points = clusters.label[member], pixel[member], points[member]
+    parts = {name: part[member] for name, part in parts.items()}
+    count = len(clusters.centre)
+    table, used = member_table(label, count, parameters.pixels)
+    R_camera_ray = ray_rotation(clusters.centre)
+    direction = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
+    T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
+    if canonical_frame.turn is AxisRotation.VISIBLE:
+        # For the fit of coordinates to start at; the search for orientations takes centre and axis alone.
+        T = T @ rotation_about_z(TURNS[axis_rotation_probability(T, direction).argmax(axis=1)])
+    else:
+        T = facing_camera(T)
+    if count and parameters.coordinates:
+        trust = used * np.exp(-np.clip(parts["coordinates_scale"][:, 0], -4.0, 0.0))[table]
+        T, _ = robust_fit(
+            parts["coordinates"][table].astype(float) * diameter,
+            points[table].astype(float),
+            trust.astype(float),
+            parameters.tolerance * diameter,
+            np.random.default_rng(0),
+            T[:, None],
+        )
+    return Instances(pixel, label, T, direction)
+
+
+def axis_rotation_probability(T_camera_axis: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """How likely each turn about the axis is by the network alone.
+
+    Args:
+        T_camera_axis: (n, 4, 4) poses; their own turn is turn 0.
+        direction: (n, DIRECTION_BINS) as :attr:`Instances.direction`.
+
+    Returns:
+        (n, len(TURNS)), each row summing to 1.
+    """
+    x = (T_camera_axis[:, None, :3, :3] @ rotation_about_z(TURNS)[:, :3, :3])[..., 0]
+    return density(direction, np.einsum("nij,nti->ntj", ray_rotation(T_camera_axis[:, :3, 3]), x))
+
+
+def _poses_from_axes(
+    parts: dict, table: np.ndarray, used: np.ndarray, votes: np.ndarray, R_camera_ray: np.ndarray
+) -> np.ndarray:
+    """(n, 4, 4) poses from the votes for centre and axis alone, at an arbitrary turn: robust means of both."""
+    centre = _robust_mean(votes[table], used * np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))[table], 0.01)
+    axis = _robust_mean(parts["axis"][table].astype(float), used.astype(float), 0.2)
+    z = np.einsum("nij,nj->ni", R_camera_ray, axis)
+    z /= np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-9)
+    across = np.where(np.abs(z[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    x = across - z * (across * z).sum(axis=1, keepdims=True)
+    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+    return make_transform(np.stack([x, np.cross(z, x), z], axis=-1), centre)
+
+
+def _robust_mean(values: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
+    """(n, 3) reweighted means of (n, p, 3) values; one ``scale`` off the mean counts a quarter."""
+    trust = weight
+    for _ in range(5):
+        mean = np.einsum("np,npi->ni", trust, values) / np.maximum(trust.sum(axis=1, keepdims=True), 1e-12)
+        trust = weight / (1 + ((values - mean[:, None]) ** 2).sum(axis=-1) / scale**2) ** 2
+    return mean
+
+
+def member_table(label: np.ndarray, count: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most ``most`` members of each label, evenly taken: (count, most) positions, and which entries are used."""
+    order = np.argsort(label, kind="stable")
+    size = np.bincount(label, minlength=count)
+    start = np.cumsum(size) - size
+    taken = np.minimum(size, most)
+    column = np.arange(most)
+    rank = column * size[:, None] // np.maximum(taken, 1)[:, None]
+    used = column < taken[:, None]
+    position = np.where(used, start[:, None] + rank, 0)
+    return (order[position] if len(order) else position), used
+
+
+def _mean(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
+    """(count, k) mean of (p, k) values per label."""
+    order = np.argsort(label, kind="stable")
+    size = np.bincount(label, minlength=count)
+    if not count:
+        return np.zeros((0, values.shape[1]))
+    return np.add.reduceat(values[order], np.cumsum(size) - size, axis=0) / size[:, None]

@@ -1,0 +1,50 @@
+"""What a view measured and to which instance each pixel belongs, as refinement and the search for a turn need it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from active6d_core.camera import PinholeCamera, backproject, normals_from_points
+from active6d_perception.estimators.dense.decoding import Instances
+from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, ReducedView
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSurface:
+    """The surface that a view shows, at the network's input resolution.
+
+    Attributes:
+        depth: (h, w) metres, NaN invalid.
+        points: (h, w, 3) in the optical frame.
+        normals: (h, w, 3) facing the camera, NaN unknown.
+        owner: (h, w) index of the pixel's instance, -1 where there is none or no depth.
+        camera: intrinsics.
+        tree: search tree over the points of instances that have normals; None if they are too few.
+        tree_normals: (p, 3) of the tree's points.
+    """
+
+    depth: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    owner: np.ndarray
+    camera: PinholeCamera
+    tree: cKDTree | None
+    tree_normals: np.ndarray
+
+    @classmethod
+    def of(cls, view: ReducedView, instances: Instances) -> "MeasuredSurface":
+        """The surface of a view in which ``instances`` were found."""
+        # The reduced depth is a mean of pixels already; smoothing it more rounds edges off and lets poses slide.
+        points = backproject(view.depth, view.camera)
+        normals = normals_from_points(points, reach=1)
+        height, width = view.depth.shape
+        coarse = np.full((height // OUTPUT_STRIDE, width // OUTPUT_STRIDE), -1)
+        coarse.ravel()[instances.pixel] = instances.label
+        enlarged = coarse.repeat(OUTPUT_STRIDE, axis=0).repeat(OUTPUT_STRIDE, axis=1)
+        owner = np.full((height, width), -1)
+        owner[: enlarged.shape[0], : enlarged.shape[1]] = enlarged
+        owner[np.isnan(view.depth)] = -1
+        usable = (owner >= 0) & np.isfinite(normals).all(axis=-1)
+        tree = cKDTree(points[usable]) if np.count_nonzero(usable) > 6 else None
+        return cls(view.depth, points, normals, owner, view.camera, tree, normals[usable])

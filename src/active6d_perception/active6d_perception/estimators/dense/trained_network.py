@@ -1,0 +1,118 @@
+"""Shipped and trained networks on disk: tensors in safetensors, everything else in a JSON file beside them."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import is_rigid
+from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
+from active6d_perception.estimators.dense.network import HEADS, DenseNetwork, NetworkSize
+from active6d_perception.estimators.dense.network_input import CHANNELS
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedNetwork:
+    """A network and what it was made for.
+
+    Attributes:
+        network: in evaluation mode.
+        canonical_frame: that it was trained with.
+        object_name: of the object it looks for.
+        diameter: of that object, metres.
+        training: how it was trained and what it reached on the validation split; for people, not used.
+    """
+
+    network: DenseNetwork
+    canonical_frame: CanonicalFrame
+    object_name: str
+    diameter: float
+    size: NetworkSize
+    training: dict = field(default_factory=dict)
+
+
+def save_network(path: Path, trained: TrainedNetwork) -> None:
+    """Write ``path`` (``.safetensors``, float16) and the JSON file of the same name beside it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Half precision halves the file; what it rounds away is far below the noise of training.
+    tensors = {
+        name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
+        for name, tensor in trained.network.state_dict().items()
+    }
+    save_file(tensors, path)
+    description = {
+        "format": _FORMAT,
+        "object": trained.object_name,
+        "diameter": trained.diameter,
+        "input_channels": CHANNELS,
+        "heads": HEADS,
+        "size": asdict(trained.size),
+        "turn": trained.canonical_frame.turn.value,
+        "T_object_axis": trained.canonical_frame.T_object_axis.tolist(),
+        "training": trained.training,
+    }
+    path.with_suffix(".json").write_text(json.dumps(description, indent=1) + "\n")
+
+
+def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
+    """Read a trained network for an object. Nothing in the files is executed.
+
+    Raises:
+        ValueError: a file is missing or damaged, or was made for another object or another version of the network; the
+            message names the file and what to do.
+    """
+    description = _read_description(path, model)
+    try:
+        size = NetworkSize(tuple(description["size"]["widths"]), description["size"]["last"])
+        canonical_frame = CanonicalFrame(
+            AxisRotation(description["turn"]), np.array(description["T_object_axis"], float), model.symmetry.discrete
+        )
+        if not is_rigid(canonical_frame.T_object_axis, 1e-5):
+            raise ValueError("T_object_axis is not a rigid transform")
+        network = DenseNetwork(size)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path.with_suffix('.json')}: bad description of a network ({error})") from error
+    try:
+        network.load_state_dict(load_file(path))
+    except (OSError, SafetensorError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"{path}: damaged, or not the weights that its .json describes ({reason}); {_advice(model)}"
+        ) from error
+    return TrainedNetwork(
+        network.eval(), canonical_frame, model.name, model.diameter, size, description.get("training") or {}
+    )
+
+
+def _read_description(path: Path, model: ObjectModel) -> dict:
+    described = path.with_suffix(".json")
+    missing = [file for file in (path, described) if not file.is_file()]
+    if missing:
+        raise ValueError(f"{missing[0]}: no such file of weights; {_advice(model)}")
+    try:
+        description = json.loads(described.read_text())
+        made_for, diameter = description["object"], float(description["diameter"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{described}: damaged ({error}); {_advice(model)}") from error
+    if made_for != model.name or abs(diameter - model.diameter) > 1e-3 * model.diameter:
+        raise ValueError(
+            f"{described}: made for {made_for} ({1000 * diameter:.1f} mm), "
+            f"not for {model.name} ({1000 * model.diameter:.1f} mm); {_advice(model)}"
+        )
+    if (description.get("format"), description.get("input_channels"), description.get("heads")) != (
+        _FORMAT,
+        CHANNELS,
+        HEADS,
+    ):
+        raise ValueError(f"{described}: made by another version of the network; {_advice(model)}")
+    return description
+
+
+def _advice(model: ObjectModel) -> str:
+    return f"train them with 'active6d train estimator --object {model.name}'"

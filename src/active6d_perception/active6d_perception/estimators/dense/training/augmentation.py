@@ -1,0 +1,63 @@
+"""Other training views made of one. Mirroring is not among them: it makes another object."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from active6d_core.camera import PinholeCamera
+from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, ReducedView
+from active6d_perception.estimators.dense.training.samples import Sample
+
+
+def augment(view: ReducedView, rng: np.random.Generator) -> ReducedView:
+    """Another colour balance, exposure, contrast and grain, and some depth missing or coarser."""
+    color = view.color.astype(np.float32) / 255
+    color = color ** rng.uniform(0.7, 1.4) * rng.uniform(0.75, 1.25) * rng.uniform(0.85, 1.15, 3).astype(np.float32)
+    if rng.random() < 0.15:
+        color = np.broadcast_to(color.mean(axis=-1, keepdims=True), color.shape)
+    color = color + rng.normal(0, rng.uniform(0, 0.03), color.shape).astype(np.float32)
+    depth = view.depth + rng.normal(0, rng.uniform(0, 0.001), view.depth.shape).astype(np.float32)
+    depth[_blobs(view.depth.shape, rng)] = np.nan
+    return replace(view, color=np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8), depth=depth)
+
+
+def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
+    """A window of the view around a random object pixel: most of a view is table, which teaches little.
+
+    Args:
+        sample: at least as large.
+        height: of the window at the network's input resolution, a multiple of its output stride; likewise ``width``.
+        width: see there.
+        rng: source of randomness.
+    """
+    on_object = np.argwhere(sample.instance >= 0)
+    centre = on_object[rng.integers(len(on_object))] if len(on_object) else np.array(sample.instance.shape) // 2
+    size = np.minimum((height, width), sample.view.depth.shape) // OUTPUT_STRIDE
+    top, left = np.clip(centre - size // 2, 0, np.array(sample.instance.shape) - size)
+    coarse = slice(top, top + size[0]), slice(left, left + size[1])
+    fine = tuple(slice(part.start * OUTPUT_STRIDE, part.stop * OUTPUT_STRIDE) for part in coarse)
+    camera = sample.view.camera
+    cropped = PinholeCamera(
+        int(size[1]) * OUTPUT_STRIDE,
+        int(size[0]) * OUTPUT_STRIDE,
+        camera.fx,
+        camera.fy,
+        camera.cx - fine[1].start,
+        camera.cy - fine[0].start,
+    )
+    view = ReducedView(sample.view.color[fine], sample.view.depth[fine], cropped)
+    return replace(sample, view=view, surface_depth=sample.surface_depth[coarse], instance=sample.instance[coarse])
+
+
+def _blobs(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """(h, w) bool: a few ellipses in which depth is missing, as on shiny surfaces; none in half of the views."""
+    hidden = np.zeros(shape, bool)
+    for _ in range(rng.integers(1, 8) if rng.random() < 0.5 else 0):
+        centre, radius = rng.uniform(0, shape), rng.uniform(2, 10, 2)
+        low = np.maximum(np.ceil(centre - radius), 0).astype(int)
+        high = np.minimum(np.floor(centre + radius) + 1, shape).astype(int)
+        v, u = np.ogrid[low[0] : high[0], low[1] : high[1]]
+        hidden[low[0] : high[0], low[1] : high[1]] |= ((v - centre[0]) / radius[0]) ** 2 + (
+            (u - centre[1]) / radius[1]
+        ) ** 2 < 1
+    return hidden

@@ -1,0 +1,245 @@
+"""The training loop: resumable, with averaged weights, the best of which by validation is exported."""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from active6d_core.object_model import ObjectModel
+from active6d_perception.estimators.dense.canonical_frame import canonical_frame_of
+from active6d_perception.estimators.dense.network import DenseNetwork, NetworkSize, has_fast_bfloat16
+from active6d_perception.estimators.dense.trained_network import TrainedNetwork, save_network
+from active6d_perception.estimators.dense.training.batches import TrainingViews, batches
+from active6d_perception.estimators.dense.training.curves import draw_curves
+from active6d_perception.estimators.dense.training.losses import LossWeights, loss_terms, total
+from active6d_perception.estimators.dense.training.samples import Sample
+from active6d_perception.estimators.dense.training.validation import validate
+
+_CLIP = 1.0  # norm of the gradient
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How to train.
+
+    Attributes:
+        steps: of the optimiser in all; the learning rate falls to zero until then.
+        batch: views per step.
+        learning_rate: at its highest, after the warm-up.
+        warmup: steps.
+        weight_decay: of AdamW.
+        averaging: weights are averaged exponentially with this factor per step.
+        checkpoint_every: steps; what an interruption costs at most.
+        validate_every: steps, a multiple of ``checkpoint_every``.
+        workers: processes that prepare batches.
+        seed: of initial weights, order and augmentation.
+        loss: weights of the loss's terms.
+        size: of the network.
+
+    Raises:
+        ValueError: a number is out of range.
+    """
+
+    steps: int = 5_500
+    batch: int = 8
+    learning_rate: float = 2e-3
+    warmup: int = 300
+    weight_decay: float = 1e-4
+    averaging: float = 0.998
+    checkpoint_every: int = 200
+    validate_every: int = 1000
+    workers: int = 1
+    seed: int = 0
+    loss: LossWeights = field(default_factory=LossWeights)
+    size: NetworkSize = field(default_factory=NetworkSize)
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "checkpoint_every", "validate_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
+        if self.validate_every % self.checkpoint_every:
+            raise ValueError("training: validate_every must be a multiple of checkpoint_every")
+
+
+@dataclass(frozen=True)
+class Report:
+    """What :func:`train` says after each step.
+
+    Attributes:
+        step: steps done.
+        loss: of this step's batch.
+        terms: that it is the weighted sum of.
+        validation: the latest rates, empty before the first validation.
+    """
+
+    step: int
+    loss: float
+    terms: dict[str, float]
+    validation: dict[str, float]
+
+
+def train(
+    model: ObjectModel,
+    shards: Sequence[Path],
+    validation: Sequence[Sample],
+    folder: Path,
+    options: TrainingOptions,
+    device: str = "cpu",
+    on_step: Callable[[Report], None] = lambda report: None,
+) -> Path:
+    """Train, or go on with the training that ``folder`` holds.
+
+    Args:
+        model: the object.
+        shards: files of training views.
+        validation: samples to choose the best weights by.
+        folder: for ``state.*`` (to resume), ``curves.json``, ``curves.png`` and ``best.*`` (the result).
+        options: how to train.
+        device: of torch, ``cpu`` or ``cuda``.
+        on_step: told of every step.
+
+    Returns:
+        path of the best weights so far.
+
+    Raises:
+        ValueError: there are no training views, or the folder's state is damaged or of other options.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    canonical_frame = canonical_frame_of(model)
+    run = _Run(folder, options, device)
+    feed = batches(
+        TrainingViews(list(shards), canonical_frame, model.diameter, (options.seed, run.step)),
+        options.batch,
+        options.workers,
+    )
+    best = folder / "best.safetensors"
+    running: list[dict[str, float]] = []
+    while run.step < options.steps:
+        inputs, targets = next(feed)
+        terms = run.advance(inputs, targets)
+        running.append(terms)
+        if run.step % options.validate_every == 0 or run.step == options.steps:
+            mean = {f"training_{name}": sum(item[name] for item in running) / len(running) for name in running[0]}
+            running.clear()
+            averaged = TrainedNetwork(run.averaged_on_cpu(), canonical_frame, model.name, model.diameter, options.size)
+            run.history.append({"step": run.step, **mean, **validate(model, averaged, validation)})
+            if max(run.history, key=worth)["step"] == run.step:
+                training = {"options": asdict(options), "heaps": len(shards), "validation": run.history[-1]}
+                save_network(
+                    best,
+                    TrainedNetwork(
+                        averaged.network, canonical_frame, model.name, model.diameter, options.size, training
+                    ),
+                )
+            (folder / "curves.json").write_text(json.dumps(run.history, indent=1) + "\n")
+            draw_curves(run.history, folder / "curves.png", title=f"{model.name}: training of the dense estimator")
+        if run.step % options.checkpoint_every == 0 or run.step == options.steps:
+            run.save()
+        on_step(Report(run.step, run.loss, terms, run.history[-1] if run.history else {}))
+    return best
+
+
+def worth(validation: dict[str, float]) -> float:
+    """What the best weights are best in: objects found, whether well or barely visible, and few of them wrong."""
+    return validation["add_half"] + validation["add_tenth"] + validation["adds_tenth"] + 0.5 * validation["precision"]
+
+
+class _Run:
+    """Network, averaged network, optimiser and history, and their file."""
+
+    def __init__(self, folder: Path, options: TrainingOptions, device: str) -> None:
+        torch.manual_seed(options.seed)
+        self._options, self._device = options, torch.device(device)
+        self._network = DenseNetwork(options.size).to(self._device, memory_format=torch.channels_last).train()
+        self._averaged = deepcopy(self._network).eval()
+        self._optimizer = torch.optim.AdamW(self._network.parameters(), weight_decay=options.weight_decay)
+        self._state_file = folder / "state.safetensors"
+        self.step = 0
+        self.loss = math.nan
+        self.history: list[dict[str, float]] = []
+        if self._state_file.is_file():
+            self._load()
+
+    def advance(self, inputs: Tensor, targets: list) -> dict[str, float]:
+        """One step of the optimiser; the loss's terms."""
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._options.learning_rate * _schedule(self.step, self._options)
+        inputs = inputs.to(self._device, memory_format=torch.channels_last)
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=has_fast_bfloat16(self._device.type)):
+            answer = self._network(inputs)
+        terms = loss_terms(answer, targets)
+        loss = total(terms, self._options.loss)
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self._network.parameters(), _CLIP)
+        self._optimizer.step()
+        self.step += 1
+        self._average()
+        self.loss = loss.item()
+        return {name: value.item() for name, value in terms.items()}
+
+    def averaged_on_cpu(self) -> DenseNetwork:
+        """A copy of the averaged network."""
+        return deepcopy(self._averaged).cpu().eval()
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        factor = min(self._options.averaging, self.step / (self.step + 10))
+        for average, current in zip(
+            self._averaged.state_dict().values(), self._network.state_dict().values(), strict=True
+        ):
+            if average.is_floating_point():
+                average.lerp_(current, 1 - factor)
+            else:
+                average.copy_(current)
+
+    def save(self) -> None:
+        """Write tensors and history; an interruption leaves the previous state."""
+        tensors = {f"network.{name}": tensor for name, tensor in self._network.state_dict().items()}
+        tensors |= {f"averaged.{name}": tensor for name, tensor in self._averaged.state_dict().items()}
+        for index, state in self._optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
+        progress = {"step": self.step, "options": asdict(self._options), "history": self.history}
+        partial = self._state_file.with_suffix(".partial")
+        # Tensors and progress are one file, so that they never disagree.
+        contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        save_file(contiguous, partial, metadata={"progress": json.dumps(progress)})
+        partial.replace(self._state_file)
+
+    def _load(self) -> None:
+        try:
+            with safe_open(self._state_file, "pt") as file:
+                progress = json.loads(file.metadata()["progress"])
+            if progress["options"] != json.loads(json.dumps(asdict(self._options))):
+                raise ValueError("it was begun with other options")
+            tensors = load_file(self._state_file, device=str(self._device))
+            self._network.load_state_dict(_under(tensors, "network."))
+            self._averaged.load_state_dict(_under(tensors, "averaged."))
+            state: dict[int, dict[str, Tensor]] = {}
+            for name, tensor in _under(tensors, "optimizer.").items():
+                index, key = name.split(".")
+                state.setdefault(int(index), {})[key] = tensor
+            self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": state})
+            self.step, self.history = progress["step"], progress["history"]
+        except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(
+                f"{self._state_file}: cannot go on with this training ({reason}); give another folder or delete it"
+            ) from error
+
+
+def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def _schedule(step: int, options: TrainingOptions) -> float:
+    """Share of the highest learning rate: a linear warm-up, then half a cosine to zero."""
+    warm = min(1.0, (step + 1) / options.warmup)
+    return warm * 0.5 * (1 + math.cos(math.pi * step / options.steps))

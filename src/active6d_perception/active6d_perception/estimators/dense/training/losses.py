@@ -1,0 +1,74 @@
+"""How wrong an answer of the network is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from active6d_perception.estimators.dense.network import split
+from active6d_perception.estimators.dense.training.targets import Targets
+
+#: Logarithmic Laplace scales are kept in this range: 0.3 % to one diameter and a half.
+SCALE_RANGE = (-5.8, 0.4)
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weight of each term; 0 switches a head's training off."""
+
+    mask: float = 1.0
+    centre: float = 2.0
+    coordinates: float = 2.0
+    scale: float = 0.1
+    axis: float = 2.0
+    axis_line: float = 2.0
+    direction: float = 1.0
+
+
+def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
+    """The terms of the loss, by the names of :class:`LossWeights`.
+
+    ``centre``, ``coordinates`` and ``axis`` are mean distances ``e``, the first two in diameters. ``scale`` is the
+    negative log-likelihood ``e / b + 3 log b`` of an isotropic Laplace distribution in space whose scale b the network
+    tells, so it learns to say where it is unsure. The errors in it are held fixed: a likelihood that trained the points
+    as well would weigh each head by 1 / b, and what is learned first (the centre) would drown what is hard (the axis).
+
+    Args:
+        answer: (n, channels, h, w), at least as large as the targets.
+        targets: of each view; all of one size.
+    """
+    height, width = targets[0].mask.shape
+    answer = answer[:, :, :height, :width].float()
+    mask = torch.stack([torch.from_numpy(target.mask) for target in targets]).to(answer.device)
+    terms = {"mask": F.binary_cross_entropy_with_logits(answer[:, 0], mask)}
+    pixel = torch.cat([torch.from_numpy(target.pixel + i * height * width) for i, target in enumerate(targets)])
+    parts = split(answer.movedim(1, -1).reshape(-1, answer.shape[1])[pixel.to(answer.device)], axis=1)
+    wanted = {name: _gather(targets, name, answer) for name in ("weight", "centre", "coordinates", "axis", "direction")}
+    weight = wanted["weight"] / wanted["weight"].sum().clamp(min=1.0)
+    terms["scale"] = answer.new_zeros(())
+    for name in ("centre", "coordinates"):
+        log_scale = parts[f"{name}_scale"][:, 0].clamp(*SCALE_RANGE)
+        error = (parts[name] - wanted[name]).norm(dim=1)
+        terms[name] = (weight * error).sum()
+        terms["scale"] = terms["scale"] + (weight * (error.detach() * torch.exp(-log_scale) + 3 * log_scale)).sum()
+    terms["axis"] = (weight * (parts["axis"] - wanted["axis"]).norm(dim=1)).sum()
+    terms["axis_line"] = (weight * (parts["axis_line"] - _line(wanted["axis"])).norm(dim=1)).sum()
+    cross_entropy = -(wanted["direction"] * F.log_softmax(parts["direction"], dim=1)).sum(dim=1)
+    terms["direction"] = (weight * cross_entropy).sum()
+    return terms
+
+
+def total(terms: dict[str, Tensor], weights: LossWeights) -> Tensor:
+    """The weighted sum of the terms."""
+    return sum(getattr(weights, name) * value for name, value in terms.items())
+
+
+def _line(axis: Tensor) -> Tensor:
+    """(p, 6) products xx, yy, zz, xy, yz, zx of (p, 3) vectors: the same for an axis and its opposite."""
+    return torch.cat([axis * axis, axis * axis.roll(-1, dims=1)], dim=1)
+
+
+def _gather(targets: Sequence[Targets], name: str, like: Tensor) -> Tensor:
+    return torch.cat([torch.from_numpy(getattr(target, name)) for target in targets]).to(like.device)

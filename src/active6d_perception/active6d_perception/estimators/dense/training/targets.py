@@ -1,0 +1,72 @@
+"""What the network should have answered: closed-form targets per output pixel, from true depth, instances and poses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from active6d_core.camera import pixel_rays
+from active6d_core.se3 import invert
+from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
+from active6d_perception.estimators.dense.network import DIRECTION_BINS
+from active6d_perception.estimators.dense.network_input import output_camera, ray_frames, ray_rotation
+from active6d_perception.estimators.dense.sphere_bins import kernel
+from active6d_perception.estimators.dense.training.samples import Sample
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Targets of one view; p pixels lie on objects.
+
+    Attributes:
+        mask: (h, w) float32, 1 on objects.
+        pixel: (p,) flat indices into (h, w).
+        weight: (p,) float32, mean 1. Instances count by the square root of their pixels, so that distant ones count,
+            and by their visible fraction, since nobody can tell the orientation of a sliver.
+        centre: (p, 3) float32, as the network's head of that name; likewise ``coordinates`` and ``axis``.
+        coordinates: (p, 3) float32.
+        axis: (p, 3) float32.
+        direction: (p, DIRECTION_BINS) float32 distribution over the sphere's bins; zero where nothing shows the turn.
+    """
+
+    mask: np.ndarray
+    pixel: np.ndarray
+    weight: np.ndarray
+    centre: np.ndarray
+    coordinates: np.ndarray
+    axis: np.ndarray
+    direction: np.ndarray
+
+
+def make_targets(sample: Sample, canonical_frame: CanonicalFrame, diameter: float) -> Targets:
+    """Targets of one sample.
+
+    Args:
+        sample: with true depth, instances and poses.
+        canonical_frame: of the object.
+        diameter: of the object, metres.
+    """
+    camera = output_camera(sample.view.camera)
+    pixel = np.flatnonzero((sample.instance >= 0) & np.isfinite(sample.surface_depth))
+    instance = sample.instance.ravel()[pixel]
+    points = pixel_rays(camera).reshape(-1, 3)[pixel] * sample.surface_depth.ravel()[pixel, None]
+    T_canonical = canonical_frame.canonical_pose(sample.T_camera_object)
+    T_axis = canonical_frame.axis_pose(sample.T_camera_object)
+    R_camera_ray = ray_frames(camera).reshape(-1, 3, 3)[pixel]
+    R_ray_camera = np.swapaxes(ray_rotation(T_axis[:, :3, 3]), 1, 2)
+    to_canonical = invert(T_canonical)[instance]
+    direction = np.zeros((len(T_axis), DIRECTION_BINS), np.float32)
+    if canonical_frame.turn is not AxisRotation.INVISIBLE:
+        direction = kernel(np.einsum("nij,nj->ni", R_ray_camera, T_axis[:, :3, 0]))
+    count = np.bincount(instance, minlength=len(T_axis))
+    weight = (sample.visible_fraction / np.sqrt(np.maximum(count, 1)))[instance]
+    return Targets(
+        mask=(sample.instance >= 0).astype(np.float32),
+        pixel=pixel,
+        weight=(weight / weight.mean() if len(weight) else weight).astype(np.float32),
+        centre=(np.einsum("pij,pi->pj", R_camera_ray, T_axis[instance, :3, 3] - points) / diameter).astype(np.float32),
+        coordinates=(
+            (np.einsum("pij,pj->pi", to_canonical[:, :3, :3], points) + to_canonical[:, :3, 3]) / diameter
+        ).astype(np.float32),
+        axis=np.einsum("nij,nj->ni", R_ray_camera, T_axis[:, :3, 2]).astype(np.float32)[instance],
+        direction=direction[instance],
+    )

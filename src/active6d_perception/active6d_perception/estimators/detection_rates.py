@@ -1,0 +1,135 @@
+"""Rates over many views of an estimator, as BOP defines them, with the uncertainty that comes from few scenes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import mannwhitneyu, spearmanr
+
+from active6d_perception.estimators.single_view_evaluation import ViewResult
+
+#: BOP counts objects from this visible fraction on.
+LEAST_VISIBLE = 0.1
+#: BOP's thresholds of MSSD as shares of the diameter.
+MSSD_THRESHOLDS = np.arange(1, 11) * 0.05
+#: BOP's thresholds of MSPD in pixels of an image 640 wide.
+MSPD_THRESHOLDS = np.arange(1, 11) * 5.0
+_RECALL_STEPS = np.linspace(0.0, 1.0, 101)
+_RESAMPLES = 2000
+
+
+def bootstrapped(hits: np.ndarray, counts: np.ndarray, groups: Sequence) -> dict[str, float | int | None]:
+    """A rate ``hits / counts`` with its 95 % interval, resampling whole groups.
+
+    Views of one scene share its objects, so that scenes are what is resampled, unless there is only one.
+
+    Args:
+        hits: (v,) per view.
+        counts: (v,) per view.
+        groups: (v,) the scene of each view.
+
+    Returns:
+        ``rate``, ``low``, ``high`` (None without a count) and ``of``, the sum of the counts.
+    """
+    total = int(np.sum(counts))
+    if total == 0:
+        return {"rate": None, "low": None, "high": None, "of": 0}
+    names, index = np.unique(groups, return_inverse=True)
+    if len(names) == 1:
+        index = np.arange(len(index))
+    sums = np.stack([np.bincount(index, weights=values) for values in (hits, counts)])
+    draws = np.random.default_rng(0).multinomial(
+        sums.shape[1], np.full(sums.shape[1], 1 / sums.shape[1]), size=_RESAMPLES
+    )
+    drawn = draws @ sums.T
+    rates = drawn[drawn[:, 1] > 0]
+    low, high = np.percentile(rates[:, 0] / rates[:, 1], (2.5, 97.5))
+    return {"rate": float(np.sum(hits) / total), "low": float(low), "high": float(high), "of": total}
+
+
+def thresholds(error: str, diameter: float, width: int) -> np.ndarray:
+    """(10,) BOP's limits of ``mssd`` (metres) or ``mspd`` (pixels of an image of that width)."""
+    return MSSD_THRESHOLDS * diameter if error == "mssd" else MSPD_THRESHOLDS * width / 640.0
+
+
+def recalls(views: Sequence[ViewResult], error: str, diameter: float) -> tuple[np.ndarray, np.ndarray]:
+    """Objects found at BOP's thresholds, task "6D localization": only as many of the best hypotheses count as there are
+    objects.
+
+    Args:
+        views: results.
+        error: ``mssd`` or ``mspd``.
+        diameter: of the object, metres.
+
+    Returns:
+        (v, 10) objects found per view and threshold, (v,) objects at least a tenth visible.
+    """
+    found, counts = np.zeros((len(views), 10)), np.zeros(len(views), int)
+    for number, view in enumerate(views):
+        valid = view.visible_fraction >= LEAST_VISIBLE
+        counts[number] = valid.sum()
+        best = np.argsort(-view.score, kind="stable")[: valid.sum()]
+        for step, limit in enumerate(thresholds(error, diameter, view.width)):
+            matched = view.match(error, limit, np.where(valid, 0, -1))
+            found[number, step] = (matched[best] >= 0).sum()
+    return found, counts
+
+
+def average_precision(views: Sequence[ViewResult], error: str, limits: Sequence[float]) -> float | None:
+    """Mean over ``limits`` of the area under precision over recall, hypotheses of all views ranked by score.
+
+    As BOP's task "6D detection" (and COCO): 101 recalls, precision made monotone; objects less than a tenth visible
+    need not be found, and whoever finds one neither gains nor loses. None without an object to be found.
+    """
+    if not _objects(views):
+        return None
+    areas = []
+    for limit in limits:
+        recall, precision = _precision_over_recall(views, error, limit)
+        first = np.searchsorted(recall, _RECALL_STEPS - 1e-12)
+        areas.append(np.append(precision, 0.0)[first].mean())
+    return float(np.mean(areas))
+
+
+def recall_at_precision(views: Sequence[ViewResult], error: str, limit: float, least: float) -> float | None:
+    """Share of the objects found where the score is cut so that at least ``least`` of the hypotheses are right.
+
+    Counted as in :func:`average_precision`; 0 where no cut is that precise, None without an object to be found.
+    """
+    if not _objects(views):
+        return None
+    recall, precision = _precision_over_recall(views, error, limit)
+    return float(recall[precision >= least].max(initial=0.0))
+
+
+def _objects(views: Sequence[ViewResult]) -> int:
+    """How many objects have to be found."""
+    return sum(int((view.visible_fraction >= LEAST_VISIBLE).sum()) for view in views)
+
+
+def _precision_over_recall(views: Sequence[ViewResult], error: str, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Recall and monotone precision as the hypotheses of all views are taken in, best first."""
+    order = np.argsort(-np.concatenate([view.score for view in views]), kind="stable")
+    counted, right = [], []
+    for view in views:
+        hidden = view.visible_fraction < LEAST_VISIBLE
+        matched = view.match(error, limit, hidden.astype(int))
+        counted.append(~np.append(hidden, False)[matched])  # -1, no match, is the last
+        right.append(matched >= 0)
+    counted, right = np.concatenate(counted)[order], np.concatenate(right)[order]
+    hits = np.cumsum(right[counted])
+    precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
+    return hits / _objects(views), precision
+
+
+def area_under_curve(score: np.ndarray, right: np.ndarray) -> float | None:
+    """Probability that a right hypothesis scores higher than a wrong one, ties counting half; None without either."""
+    if right.all() or not right.any():
+        return None
+    return float(mannwhitneyu(score[right], score[~right]).statistic / (right.sum() * (~right).sum()))
+
+
+def rank_correlation(score: np.ndarray, error: np.ndarray) -> float | None:
+    """Spearman's; None where one of them is constant."""
+    if len(score) < 3 or np.ptp(score) == 0 or len(np.unique(error)) == 1:
+        return None
+    return float(spearmanr(score, error).statistic)

@@ -1,0 +1,214 @@
+"""Refining, judging and thinning out pose candidates against a depth image; common to all estimators.
+
+Only the model's surface that the camera can see takes part: with hidden surface in it, the iterative closest point
+method pulls the far side of a thin-walled object onto the near side's measurements.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from active6d_core.camera import PinholeCamera, project
+from active6d_perception.model.model_views import ModelViews
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What a depth image says of k poses, as fractions of the model surface that the camera would see.
+
+    Attributes:
+        fitting: (k,) measured where the pose puts it, with a normal alike.
+        violated: (k,) the camera looked through it: something behind it was measured.
+        occluded: (k,) behind something else.
+    """
+
+    fitting: np.ndarray
+    violated: np.ndarray
+    occluded: np.ndarray
+
+
+def weigh_evidence(
+    views: ModelViews,
+    T_camera_object: np.ndarray,
+    depth: np.ndarray,
+    normals: np.ndarray,
+    camera: PinholeCamera,
+    *,
+    samples: int = 128,
+    tolerance: float = 0.006,
+) -> Evidence:
+    """Compare the visible model surface of each pose with the depth measured at its pixels.
+
+    Args:
+        views: the object's precomputed views.
+        T_camera_object: (k, 4, 4).
+        depth: (H, W) metres, NaN invalid.
+        normals: (H, W, 3) facing the camera, NaN unknown.
+        camera: intrinsics of both.
+        samples: visible model points compared per pose.
+        tolerance: metres along the ray within which a point is where it is said to be; twice that is a violation.
+    """
+    index, used = views.visible_subset(samples)
+    direction = views.nearest_direction(T_camera_object)
+    chosen, used = index[direction], used[direction]
+    R = T_camera_object[:, :3, :3].astype(np.float32)
+    points = views.points[chosen] @ np.swapaxes(R, 1, 2) + T_camera_object[:, None, :3, 3].astype(np.float32)
+    surface_normals = views.normals[chosen] @ np.swapaxes(R, 1, 2)
+    z = np.maximum(points[..., 2], 1e-3)
+    u = np.rint(points[..., 0] / z * camera.fx + camera.cx).astype(np.intp)
+    v = np.rint(points[..., 1] / z * camera.fy + camera.cy).astype(np.intp)
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    pixel = np.where(inside, v * camera.width + u, 0)
+    behind = z - depth.ravel()[pixel]
+    alike = np.einsum("ksi,ksi->ks", normals.reshape(-1, 3)[pixel], surface_normals) > 0.7
+    used &= np.isfinite(behind) | ~inside
+    total = np.maximum(used.sum(axis=1), 1)
+
+    def fraction(mask: np.ndarray) -> np.ndarray:
+        return (mask & used).sum(axis=1) / total
+
+    return Evidence(
+        fitting=fraction(inside & (np.abs(behind) < tolerance) & alike),
+        violated=fraction(inside & (behind < -2 * tolerance)),
+        occluded=fraction(inside & (behind > 2 * tolerance)),
+    )
+
+
+def refine(
+    views: ModelViews,
+    T_camera_object: np.ndarray,
+    scene: cKDTree,
+    scene_normals: np.ndarray,
+    *,
+    gates: tuple[float, ...] = (0.008, 0.004),
+    iterations: int = 5,
+    samples: int = 192,
+) -> np.ndarray:
+    """Point-to-plane ICP of many poses at once, each with only the model points visible from the camera.
+
+    Every visible model point takes the nearest scene point within the gate whose normal is alike; planes are the
+    model's, which are free of noise.
+
+    Args:
+        views: the object's precomputed views.
+        T_camera_object: (k, 4, 4) initial poses.
+        scene: search tree over (n, 3) measured points in the optical frame.
+        scene_normals: (n, 3) unit normals facing the camera.
+        gates: metres, the largest correspondence distance of each stage.
+        iterations: per stage.
+        samples: model points per pose.
+
+    Returns:
+        (k, 4, 4) refined poses; one with fewer than 6 correspondences stays as it was.
+    """
+    T = np.array(T_camera_object, float)
+    index, used = views.visible_subset(samples)
+    for gate in gates:
+        direction = views.nearest_direction(T)
+        chosen, valid = index[direction], used[direction]
+        for _ in range(iterations):
+            R = T[:, :3, :3]
+            points = views.points[chosen] @ np.swapaxes(R, 1, 2) + T[:, None, :3, 3]
+            normals = views.normals[chosen] @ np.swapaxes(R, 1, 2)
+            distance, nearest = scene.query(points, distance_upper_bound=gate)
+            matched = valid & np.isfinite(distance)
+            nearest = np.where(matched, nearest, 0)
+            matched &= np.einsum("ksi,ksi->ks", scene_normals[nearest], normals) > 0.5
+            T = _point_to_plane_step(T, points, normals, scene.data[nearest], matched)
+    return T
+
+
+def _point_to_plane_step(
+    T: np.ndarray, points: np.ndarray, normals: np.ndarray, targets: np.ndarray, matched: np.ndarray
+) -> np.ndarray:
+    """One Gauss-Newton step for (k, 4, 4) poses, each turned about its own origin to keep the system well scaled."""
+    arms = points - T[:, None, :3, 3]
+    jacobian = np.concatenate([np.cross(arms, normals), normals], axis=-1) * matched[..., None]
+    residual = np.einsum("ksi,ksi->ks", targets - points, normals) * matched
+    A = np.swapaxes(jacobian, 1, 2) @ jacobian
+    # A direction that the points leave free (the axis of a cup) must not move; damping holds it.
+    A += np.eye(6) * (1e-4 * np.trace(A, axis1=1, axis2=2)[:, None, None] / 6 + 1e-12)
+    step = np.linalg.solve(A, np.einsum("ksi,ks->ki", jacobian, residual)[..., None])[..., 0]
+    step[matched.sum(axis=1) < 6] = 0.0
+    moved = T.copy()
+    moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]
+    moved[:, :3, 3] += step[:, 3:]
+    return moved
+
+
+def suppress(distance: np.ndarray, score: np.ndarray, radius: float) -> np.ndarray:
+    """Greedy non-maximum suppression.
+
+    Args:
+        distance: (k, k) metres between poses.
+        score: (k,).
+        radius: metres; of two poses closer than this only the better one stays, of equals the first.
+
+    Returns:
+        indices kept, best first.
+    """
+    free = np.ones(len(score), bool)
+    kept = []
+    for index in np.argsort(-score, kind="stable"):
+        if free[index]:
+            kept.append(index)
+            free &= distance[index] >= radius
+    return np.array(kept, np.intp)
+
+
+def claim_pixels(
+    views: ModelViews,
+    T_camera_object: np.ndarray,
+    points: np.ndarray,
+    candidates: np.ndarray,
+    camera: PinholeCamera,
+    *,
+    gate: float = 0.006,
+    min_new: float = 0.5,
+    min_pixels: int = 30,
+) -> np.ndarray:
+    """Masks of poses: the measured pixels that lie on a pose's visible surface. Poses that add nothing get none.
+
+    Poses claim their pixels in the order given (best first). One that finds less than ``min_new`` of its pixels
+    unclaimed explains what another explains better, and is left out. In the end each pixel goes to the nearest pose.
+
+    Args:
+        views: the object's precomputed views.
+        T_camera_object: (k, 4, 4), best first.
+        points: (H, W, 3) measured points, optical frame, NaN invalid.
+        candidates: (H, W) bool pixels that may belong to an object.
+        camera: intrinsics.
+        gate: metres; a pixel farther than this from a pose is not claimed by it.
+        min_new: fraction.
+        min_pixels: a mask smaller than this is no mask.
+
+    Returns:
+        (H, W) uint16: 1 + index of the pose, 0 for none.
+    """
+    label = np.zeros(candidates.shape, np.uint16)
+    nearest = np.full(candidates.shape, gate)
+    for index, (T, direction) in enumerate(zip(T_camera_object, views.nearest_direction(T_camera_object), strict=True)):
+        crop = _box_of_pose(views, T, camera)
+        rows, columns = np.nonzero(candidates[crop])
+        local = (points[crop][rows, columns] - T[:3, 3]) @ T[:3, :3]
+        distance, _ = views.visible_tree(int(direction))[1].query(local, distance_upper_bound=gate)
+        near = distance < gate
+        rows, columns, distance = rows[near], columns[near], distance[near]
+        if (label[crop][rows, columns] == 0).sum() < max(min_new * len(rows), min_pixels):
+            continue
+        closer = distance < nearest[crop][rows, columns]
+        nearest[crop][rows[closer], columns[closer]] = distance[closer]
+        label[crop][rows[closer], columns[closer]] = index + 1
+    too_small = np.bincount(label.ravel()) < min_pixels
+    label[too_small[label]] = 0
+    return label
+
+
+def _box_of_pose(views: ModelViews, T_camera_object: np.ndarray, camera: PinholeCamera) -> tuple[slice, slice]:
+    outline = views.outline @ T_camera_object[:3, :3].T + T_camera_object[:3, 3]
+    uv = project(np.maximum(outline, (-np.inf, -np.inf, 1e-3)), camera)
+    low = np.clip(np.floor(uv.min(axis=0)).astype(int) - 2, 0, (camera.width, camera.height))
+    high = np.clip(np.ceil(uv.max(axis=0)).astype(int) + 3, 0, (camera.width, camera.height))
+    return slice(low[1], high[1]), slice(low[0], high[0])

@@ -1,0 +1,1 @@
+"""What a camera sees of an object model, and distances between its poses."""

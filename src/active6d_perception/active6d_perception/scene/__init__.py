@@ -1,0 +1,1 @@
+"""The scene from several views: verification, fusion, observed surface and expected visibility."""

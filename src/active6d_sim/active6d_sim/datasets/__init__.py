@@ -1,0 +1,1 @@
+"""Recorded scenes in BOP format, and rendered training views."""

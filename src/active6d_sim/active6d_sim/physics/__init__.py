@@ -1,0 +1,1 @@
+"""Piles of objects, simulated by rigid-body physics."""

@@ -1,0 +1,1 @@
+"""The simulated RGB-D camera: renderer, appearance and sensor noise."""

@@ -1,0 +1,77 @@
+"""A camera in a scene, without ROS: what it sees from where, and which goals it accepts."""
+
+import numpy as np
+
+from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View
+from active6d_core.se3 import is_rigid
+from active6d_core.view_sphere import ViewSphere
+from active6d_sim.rendering.renderer import RenderedView, SceneRenderer
+from active6d_sim.rendering.sensor import SensorNoise, apply
+from active6d_sim.scenes.scene import Scene
+
+NANOSECONDS = 1_000_000_000
+
+
+class GoalError(ValueError):
+    """A view goal that the camera cannot go to; the text says why."""
+
+
+class Simulator:
+    """An RGB-D camera that can be put anywhere in a scene."""
+
+    def __init__(
+        self, scene: Scene, camera: PinholeCamera = DEFAULT_CAMERA, noise: SensorNoise = SensorNoise(), seed: int = 0
+    ) -> None:
+        """
+        Args:
+            scene: what there is to see.
+            camera: intrinsics of both images.
+            noise: of the sensor.
+            seed: of the sensor's noise and of the scene's looks.
+        """
+        self.scene, self.camera, self.noise, self.seed = scene, camera, noise, seed
+        self.renderer = SceneRenderer(scene, appearance_seed=seed)
+
+    def capture(self, T_world_camera: np.ndarray, stamp: int) -> View:
+        """The view from (4, 4) ``T_world_camera``; its noise depends on the seed and ``stamp`` (nanoseconds) alone."""
+        return self.sense(self.renderer.render(T_world_camera, self.camera), T_world_camera, stamp, self.noise)
+
+    def sense(self, rendered: RenderedView, T_world_camera: np.ndarray, stamp: int, noise: SensorNoise) -> View:
+        """What the sensor makes of a view rendered from (4, 4) ``T_world_camera``, with other noise than its own."""
+        rng = np.random.default_rng([self.seed, stamp])
+        color, depth = apply(rendered, self.camera, noise, rng)
+        return View(stamp, color, depth, self.camera, np.array(T_world_camera, float))
+
+
+def admit_goal(T_world_goal: np.ndarray, sphere: ViewSphere, *, snap: bool, tolerance: float) -> np.ndarray:
+    """Where the camera goes when it is asked to go to ``T_world_goal``.
+
+    Args:
+        T_world_goal: (4, 4) pose of the optical frame.
+        sphere: the hemisphere of views.
+        snap: to the grid's nearest view; otherwise exactly there.
+        tolerance: metres that a goal may be off the hemisphere.
+
+    Returns:
+        (4, 4) ``T_world_camera``.
+
+    Raises:
+        GoalError: the pose is not rigid, not above the table, or off the hemisphere.
+    """
+    if not is_rigid(T_world_goal):
+        raise GoalError("view goal is not a rigid pose")
+    position = np.asarray(T_world_goal, float)[:3, 3]
+    if position[2] <= 0:
+        raise GoalError(f"view goal is below the table (z = {position[2]:.3f} m)")
+    radius = float(np.linalg.norm(position))
+    if abs(radius - sphere.radius) > tolerance:
+        raise GoalError(
+            f"view goal is {radius:.3f} m from the bin's centre, "
+            f"more than {tolerance} m off the hemisphere of {sphere.radius} m"
+        )
+    return sphere.pose(sphere.positions[sphere.nearest(position)]) if snap else np.array(T_world_goal, float)
+
+
+def arrival(stamp: int, arc: float, speed: float) -> int:
+    """Stamp (ns) of the view after a move of ``arc`` metres at ``speed`` metres a second, at least 0.1 s later."""
+    return stamp + max(round(arc / speed * NANOSECONDS), NANOSECONDS // 10)

@@ -1,0 +1,1 @@
+"""Scenes, and the stored ones with their train, validation and test splits."""

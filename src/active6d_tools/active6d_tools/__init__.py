@@ -1,0 +1,1 @@
+"""The `active6d` command, benchmarks, reports, results and studies."""

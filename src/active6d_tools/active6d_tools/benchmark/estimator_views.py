@@ -1,0 +1,167 @@
+"""Runs estimators on the same views of stored scenes, and counts how much fusion of several views adds."""
+
+import resource
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from active6d_core.files import sha256_of
+from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.estimators.registry import Estimator, create_estimator, weights_path
+from active6d_perception.estimators.single_view_evaluation import EstimatorResult, detection_over_views, evaluate_view
+from active6d_perception.scene.verification import Verifier
+from active6d_sim.scenes.scene_store import SPLITS, load_scene
+from active6d_tools.benchmark.estimator_summary import summarise
+from active6d_tools.benchmark.grid_views import GridViews
+from active6d_tools.benchmark.peers import PEERS
+from active6d_tools.benchmark.records import Records
+
+OnProgress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """An estimator that takes part.
+
+    Attributes:
+        name: of the estimator or of the peer.
+        identity: the name and, for a learned one, which weights.
+        estimator: ready to run.
+    """
+
+    name: str
+    identity: str
+    estimator: Estimator
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What was measured.
+
+    Attributes:
+        document: what ``active6d benchmark estimator --json`` writes.
+        results: of all views by (noise, name of the estimator).
+    """
+
+    document: dict[str, Any]
+    results: dict[tuple[float, str], EstimatorResult]
+
+
+def enlist(
+    model: ObjectModel, estimators: Sequence[str], *, weights: Path | None = None, peers: bool = False
+) -> list[Contender]:
+    """Make the estimators that take part.
+
+    Args:
+        model: the object that they look for.
+        estimators: names of registered ones.
+        weights: of ``dense``, the shipped ones when None.
+        peers: whether those of :mod:`~active6d_tools.benchmark.peers` take part, too.
+
+    Raises:
+        ValueError: a name is unknown, weights are missing, or the library of a peer is not installed.
+    """
+    contenders = []
+    for name in dict.fromkeys(estimators):
+        if name == "dense":
+            path = weights or weights_path(model.name)
+            estimator = create_estimator(name, model, weights=str(path))
+            contenders.append(Contender(name, f"{name} {sha256_of(path)[:12]}", estimator))
+        else:
+            contenders.append(Contender(name, name, create_estimator(name, model)))
+    if peers:
+        contenders += [Contender(name, name, factory(model)) for name, factory in PEERS.items()]
+    return contenders
+
+
+def measure_estimators(
+    object_name: str,
+    split: str,
+    contenders: Sequence[Contender],
+    *,
+    sample: int | None = None,
+    moves: int = 0,
+    seed: int = 0,
+    noises: Sequence[float] = (1.0,),
+    records: Path | None = None,
+    on_progress: OnProgress = lambda what, done, total: None,
+) -> Measurement:
+    """Run estimators on the same views of stored scenes, each view rendered once.
+
+    Args:
+        object_name: what is in the bins.
+        split: of the stored scenes.
+        contenders: as from :func:`enlist`.
+        sample: number of (scene, view) pairs drawn by ``seed``; None takes every view of every scene.
+        moves: views after the first in one random walk a scene, for what fusion finds at the first of ``noises``; 0
+            leaves that out, as it is left out for peers.
+        seed: of the sample, the walks and the sensor's noise.
+        noises: factors on the sensor's noise; 0 switches it off.
+        records: results of single views go to this file, and are taken from it where it has them.
+        on_progress: called with what is being done, and how much of it is done.
+
+    Raises:
+        ValueError: the object or the split is not known, or the records are of other measurements.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"unknown split '{split}'; known: {', '.join(SPLITS)}")
+    model = load_object(object_name)
+    scenes = [load_scene(object_name, split, index) for index in range(SPLITS[split])]
+    store = Records(records, {"object": object_name, "split": split, "seed": seed})
+    rng = np.random.default_rng(seed)
+    pairs = _draw_views(rng, len(scenes), sample)
+    views, verifier = GridViews(model, scenes, seed), Verifier(model)
+    tasks = [(*pair, noise, contender) for pair in pairs for noise in noises for contender in contenders]
+    for done, (scene, view, noise, contender) in enumerate(tasks):
+        on_progress(f"{contender.name}, {scenes[scene].name}, view {view}", done, len(tasks))
+        key = (contender.identity, noise, scene, view)
+        if key not in store:
+            labelled = views.capture(scene, view, noise)
+            store.add(key, evaluate_view(contender.estimator, verifier, model, labelled))
+    on_progress("views", len(tasks), len(tasks))
+    results = {
+        (noise, contender.name): EstimatorResult(
+            model.diameter, tuple(store[contender.identity, noise, scene, view] for scene, view in pairs)
+        )
+        for noise in noises
+        for contender in contenders
+    }
+    rows: dict[str, dict[str, Any]] = {f"{noise:g}": {} for noise in noises}
+    for (noise, name), result in results.items():
+        rows[f"{noise:g}"][name] = summarise(model, result, [scene for scene, _ in pairs])
+    walks = [[int(view) for view in rng.permutation(len(ViewSphere()))[: moves + 1]] for _ in scenes]
+    for contender in contenders:
+        if moves and contender.name not in PEERS:
+            on_progress(f"{contender.name}, fused", len(tasks), len(tasks))
+            episodes = ([views.capture(scene, view, noises[0]) for view in walk] for scene, walk in enumerate(walks))
+            fused = detection_over_views(contender.estimator, model, episodes).mean(axis=0)
+            rows[f"{noises[0]:g}"][contender.name]["fused"] = fused.tolist()
+    document = {
+        "object": object_name,
+        "split": split,
+        "views": len(pairs),
+        "seed": seed,
+        "estimators": {contender.name: contender.identity for contender in contenders},
+        "peak_memory_mib": _peak_memory_mib(),
+        "noise": rows,
+    }
+    return Measurement(document, results)
+
+
+def _draw_views(rng: np.random.Generator, scenes: int, sample: int | None) -> list[tuple[int, int]]:
+    """(scene, view) pairs in order."""
+    pairs = [(scene, view) for scene in range(scenes) for view in range(len(ViewSphere()))]
+    if sample is None or sample >= len(pairs):
+        return pairs
+    return [pairs[i] for i in sorted(rng.choice(len(pairs), sample, replace=False))]
+
+
+def _peak_memory_mib() -> float:
+    """Of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1024 if sys.platform.startswith("linux") else peak / 1024**2

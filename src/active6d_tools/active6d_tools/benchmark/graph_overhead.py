@@ -1,0 +1,250 @@
+"""What the node graph costs over calling the core functions, and how fast verification and fusion are.
+
+The camera and the estimator are replaced by what they would say, computed beforehand: a heap of 18 mugs rendered at
+full size, and 20 hypotheses a view near the true poses. Neither ray casting nor estimation is in any of the times; all
+messages have their full size, and conversions, transport, callbacks, verification, fusion and policy are real.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
+
+from active6d_bringup.graph.composition import ComposedGraph, GraphDescription, running
+from active6d_bringup.graph.episode import EpisodeMonitor
+from active6d_core.camera import DEFAULT_CAMERA, View
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.ros.conversions import (
+    camera_to_info,
+    color_to_image,
+    depth_to_image,
+    make_header,
+    transform_to_pose_stamped,
+)
+from active6d_core.ros.node import GraphNode
+from active6d_core.se3 import make_transform
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.estimators.registry import register_estimator
+
+_SECOND = 1_000_000_000
+OnProgress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedViews:
+    """Views of one heap and the hypotheses that stand in for an estimator's, by stamp."""
+
+    model: ObjectModel
+    views: list[View]
+    hypotheses: dict[int, Hypotheses]
+
+
+#: What the estimator named "prepared" answers; set by :func:`measure_graph`.
+_prepared: dict[int, Hypotheses] = {}
+
+
+@register_estimator("prepared")
+class PreparedEstimator:
+    """Answers by stamp, at once."""
+
+    def __init__(self, model: ObjectModel) -> None:
+        self._model = model
+
+    def estimate(self, view: View) -> Hypotheses:
+        """What was prepared for this view's stamp."""
+        return _prepared[view.stamp]
+
+
+class PreparedCamera(GraphNode):
+    """Publishes the prepared views one after the other, whatever the goal, and notes when each goal came."""
+
+    def __init__(self, views: list[View], **arguments: Any) -> None:
+        super().__init__("camera_simulator", **arguments)
+        self._views = iter(views)
+        self.times: list[float] = []
+        self._color = self.output(Image, "camera/color/image_raw", latched=True)
+        self._depth = self.output(Image, "camera/depth/image_raw", latched=True)
+        self._info = self.output(CameraInfo, "camera/color/camera_info", latched=True)
+        self._pose = self.output(PoseStamped, "camera/pose", latched=True)
+        self._start = self.output(DiagnosticArray, "episode/start", latched=True)
+        self.input(PoseStamped, "view_goal", self._on_goal)
+        self.input(DiagnosticArray, "episode/end", self._on_goal, latched=True)
+
+    def begin(self) -> None:
+        """Announce the episode and publish the first view."""
+        self._start.publish(DiagnosticArray(header=make_header(_SECOND, self.world_frame)))
+        self._on_goal(None)
+
+    def _on_goal(self, message: Any) -> None:
+        self.times.append(time.perf_counter())
+        view = next(self._views, None)
+        if view is None:
+            return
+        self._color.publish(color_to_image(view.color, view.stamp, self.camera_frame))
+        self._depth.publish(depth_to_image(view.depth, view.stamp, self.camera_frame))
+        self._info.publish(camera_to_info(view.camera, view.stamp, self.camera_frame))
+        self._pose.publish(transform_to_pose_stamped(view.T_world_camera, view.stamp, self.world_frame))
+
+
+def prepare_views(
+    object_name: str, seed: int, count: int, hypotheses: int, *, objects: int | None = None
+) -> PreparedViews:
+    """Render ``count`` random views of a heap, with ``hypotheses`` of them per view around the true poses.
+
+    The heap has ``objects`` instances, by default nearly as many as the object's heaps may have.
+    """
+    from active6d_sim.physics.heap import drop_heap
+    from active6d_sim.rendering.renderer import SceneRenderer
+
+    model, sphere, rng = load_object(object_name), ViewSphere(), np.random.default_rng(seed)
+    scene = drop_heap(model, seed, count=objects or model.instances[1] - 2)
+    renderer = SceneRenderer(scene)
+    views, found = [], {}
+    for index, position in enumerate(rng.permutation(len(sphere))[:count]):
+        T_world_camera = sphere.pose(sphere.positions[position])
+        image = renderer.render(T_world_camera)
+        stamp = (index + 1) * _SECOND
+        noise = rng.normal(0.0, 0.001, image.depth.shape).astype(np.float32)
+        views.append(View(stamp, image.color, image.depth + noise, DEFAULT_CAMERA, T_world_camera))
+        T_camera_object = np.linalg.inv(T_world_camera) @ scene.T_world_all
+        found[stamp] = _near_the_truth(T_camera_object, image.instance, views[-1].depth, hypotheses, rng)
+    return PreparedViews(model, views, found)
+
+
+def _near_the_truth(
+    T_camera_object: np.ndarray, instance: np.ndarray, depth: np.ndarray, count: int, rng: np.random.Generator
+) -> Hypotheses:
+    """``count`` hypotheses a few millimetres and degrees off, dealt to the objects with the most visible pixels."""
+    pixels = np.bincount(instance[instance >= 0], minlength=len(T_camera_object))
+    ranked = np.argsort(-pixels)[: np.count_nonzero(pixels)]
+    label = np.arange(count) % len(ranked)
+    turn = Rotation.from_rotvec(rng.normal(0.0, 0.03, (count, 3))).as_matrix()
+    off = make_transform(turn, rng.normal(0.0, 0.002, (count, 3)))
+    label_of = np.zeros(len(T_camera_object) + 1, np.uint16)
+    label_of[ranked] = np.arange(1, len(ranked) + 1)
+    return Hypotheses.from_masks(
+        T_camera_object[ranked[label]] @ off, rng.random(count), label + 1, label_of[instance], depth
+    )
+
+
+def measure_graph(
+    object_name: str = "mug",
+    *,
+    seed: int = 0,
+    views: int = 11,
+    hypotheses: int = 20,
+    repeats: int = 8,
+    on_progress: OnProgress = lambda what, done, total: None,
+) -> dict[str, Any]:
+    """Compare the composed graph with direct calls, view by view.
+
+    Times are medians of the repeats, view by view.
+
+    Args:
+        object_name: what is in the bin.
+        seed: of heap, views and hypotheses.
+        views: of one episode; T = views - 1.
+        hypotheses: per view.
+        repeats: episodes of each kind.
+        on_progress: called with what is being done, and how much of it is done.
+
+    Returns:
+        ``overhead_ms``: mean over the views of graph minus direct, milliseconds a view, without a recorder;
+        ``overhead_recorded_ms``: the same with a recorder in the graph, which compresses and writes everything;
+        ``graph_ms``, ``recorded_ms``, ``direct_ms``: the times a view themselves; ``fusion_ms`` and ``fusion_hz``:
+        verification and fusion of the last view by direct call; ``image_bytes``: of one view's images.
+    """
+    on_progress("rendering views", 0, 1)
+    prepared = prepare_views(object_name, seed, views, hypotheses)
+    _prepared.clear()
+    _prepared.update(prepared.hypotheses)
+    times: dict[str, list[np.ndarray]] = {"direct": [], "fusion": [], "graph": [], "recorded": []}
+    for repeat in range(repeats):
+        on_progress("episodes", repeat, repeats)
+        direct, fusion = _direct(prepared)
+        times["direct"].append(direct)
+        times["fusion"].append(fusion)
+        times["graph"].append(_through_graph(prepared, None))
+        with tempfile.TemporaryDirectory() as folder:
+            times["recorded"].append(_through_graph(prepared, Path(folder) / "bag"))
+    on_progress("episodes", repeats, repeats)
+    first = prepared.views[0]
+    return {
+        "object": object_name,
+        "views": views,
+        "hypotheses": hypotheses,
+        "repeats": repeats,
+        "image_bytes": first.color.nbytes + first.depth.nbytes + first.depth.size * 2,
+        **_summary(times),
+    }
+
+
+def _summary(times: dict[str, list[np.ndarray]]) -> dict[str, float]:
+    """Milliseconds a view by kind of episode, from the median of each view's repeats."""
+    per_view = {kind: 1e3 * np.median(samples, axis=0) for kind, samples in times.items()}
+    return {
+        "overhead_ms": float((per_view["graph"] - per_view["direct"]).mean()),
+        "overhead_recorded_ms": float((per_view["recorded"] - per_view["direct"]).mean()),
+        **{f"{kind}_ms": float(per_view[kind].mean()) for kind in ("graph", "recorded", "direct")},
+        "fusion_ms": float(per_view["fusion"][-1]),
+        "fusion_hz": float(1e3 / per_view["fusion"][-1]),
+    }
+
+
+def _direct(prepared: PreparedViews) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds per view of the core functions, and of those the part of verification and fusion."""
+    from active6d_agent.policies.registry import Observation, create_policy
+    from active6d_perception.scene.fusion import SceneFusion
+    from active6d_perception.scene.observed_surface import ObservedSurface
+    from active6d_perception.scene.verification import Verifier
+
+    verifier, fusion, surface = Verifier(prepared.model), SceneFusion(prepared.model), ObservedSurface(prepared.model)
+    policy, sphere = create_policy("lowest-score", prepared.model), ViewSphere()
+    policy.reset(np.random.default_rng(0))
+    allowed, positions = np.ones(len(sphere), bool), []
+    total, fusing = [], []
+    for left, view in zip(range(len(prepared.views), 0, -1), prepared.views, strict=True):
+        began = time.perf_counter()
+        found = prepared.hypotheses[view.stamp]
+        scores = verifier.score(view.depth, view.camera, found)
+        fusion.add_view(view.stamp, view.T_world_camera, found, scores)
+        surface.add_view(view.stamp, view.depth, view.camera, view.T_world_camera)
+        objects = fusion.objects(view.stamp, view.T_world_camera, view.camera)
+        unexplained = surface.unexplained(objects.T_world_object)
+        fused = time.perf_counter()
+        positions.append(view.T_world_camera[:3, 3])
+        policy.decide(Observation(objects, np.array(positions), sphere, allowed, left, unexplained=unexplained))
+        total.append(time.perf_counter() - began)
+        fusing.append(fused - began)
+    return np.array(total), np.array(fusing)
+
+
+def _through_graph(prepared: PreparedViews, bag: Path | None) -> np.ndarray:
+    """Seconds per view from the goal that asks for it to the goal (or the end) that follows it."""
+    name = prepared.model.name
+    nodes: dict[str, dict[str, Any]] = {
+        "pose_estimator": {"object": name, "estimator": "prepared"},
+        "hypothesis_fusion": {"object": name},
+        "attention_policy": {"object": name, "policy": "lowest-score", "steps": len(prepared.views)},
+    }
+    if bag is not None:
+        nodes["episode_recorder"] = {"bag": str(bag)}
+    with running(ComposedGraph(GraphDescription(nodes))) as graph:
+        monitor = EpisodeMonitor(graph.context, "", lambda step: None)
+        graph.add(monitor)
+        graph.start()
+        camera = PreparedCamera(prepared.views, context=graph.context)
+        graph.add(camera)
+        camera.start()
+        while len(camera.times) <= len(prepared.views):
+            graph.spin_once(1.0)
+        return np.diff(camera.times)

@@ -1,0 +1,76 @@
+"""Results of single views in a file of JSON lines, so that a long benchmark goes on where it was stopped."""
+
+import json
+from collections.abc import Hashable
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from active6d_perception.estimators.single_view_evaluation import ViewResult
+
+_INTEGERS = {"hypothesis", "object"}
+_PLAIN = {"width", "seconds", "cpu_seconds", "stage_ms"}
+
+
+class Records:
+    """Results by key; kept in memory only without a path."""
+
+    def __init__(self, path: Path | None, header: dict[str, Any]) -> None:
+        """
+        Args:
+            path: read if it exists, and appended to.
+            header: what all results have in common; a file with another header is refused.
+
+        Raises:
+            ValueError: the file is no such file, or of other measurements; the message names it.
+        """
+        self._path = path
+        self._results: dict[Hashable, ViewResult] = {}
+        if path is None:
+            return
+        if path.is_file():
+            self._read(path, header)
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(header) + "\n")
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._results
+
+    def __getitem__(self, key: Hashable) -> ViewResult:
+        return self._results[key]
+
+    def add(self, key: tuple, result: ViewResult) -> None:
+        """Keep a result, on disk before this returns."""
+        self._results[key] = result
+        if self._path is not None:
+            entry = {
+                name: np.round(value, 7).tolist() if isinstance(value, np.ndarray) else value
+                for name, value in asdict(result).items()
+            }
+            with self._path.open("a") as file:
+                file.write(json.dumps({"key": key, **entry}) + "\n")
+
+    def _read(self, path: Path, header: dict[str, Any]) -> None:
+        text = path.read_text()
+        whole = text[: text.rfind("\n") + 1]
+        try:
+            first, *entries = [json.loads(line) for line in whole.splitlines()]
+            if first != header:
+                raise ValueError(f"it is of {first}, this is {header}; choose another file")
+            for entry in entries:
+                self._results[tuple(entry["key"])] = _result(entry)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}: cannot go on with these records ({error})") from error
+        if whole != text:  # whoever wrote the last line was stopped in the middle of it
+            path.write_text(whole)
+
+
+def _result(entry: dict[str, Any]) -> ViewResult:
+    values = {}
+    for name in (item.name for item in fields(ViewResult)):
+        dtype = int if name in _INTEGERS else float
+        values[name] = entry[name] if name in _PLAIN else np.array(entry[name], dtype)
+    return ViewResult(**values)

@@ -1,0 +1,97 @@
+"""The ``active6d`` command: one file a subcommand, every heavy import inside the function that needs it."""
+
+import os
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+from typer.exceptions import TyperException
+
+from active6d_tools.cli import (
+    ablate,
+    agent_benchmark,
+    bank,
+    benchmark,
+    doctor,
+    episode,
+    estimator_benchmark,
+    estimator_training,
+    evaluate,
+    objects,
+    policy_training,
+    replay,
+    report,
+    scenes,
+)
+
+
+class CommandGroup(TyperGroup):
+    """AxisRotationErrors bad input into one clear line on standard error and exit code 2."""
+
+    def invoke(self, ctx: typer.Context) -> Any:
+        """Run the command.
+
+        Raises:
+            typer.Exit: with code 2 after bad input.
+        """
+        try:
+            return super().invoke(ctx)
+        except TyperException as error:
+            context = getattr(error, "ctx", None) or ctx
+            self._refuse(f"{error.format_message()} (see {context.command_path} --help)", error)
+        except BrokenPipeError:
+            raise
+        # The packages say what is wrong with a name, a file or a parameter by these two, in one line.
+        except (ValueError, OSError) as error:
+            self._refuse(str(error), error)
+
+    @staticmethod
+    def _refuse(text: str, error: Exception) -> None:
+        if os.environ.get("ACTIVE6D_TRACEBACK"):
+            raise error
+        typer.echo(f"active6d: {' '.join(text.split())}", err=True)
+        raise typer.Exit(2) from error
+
+
+app = typer.Typer(
+    cls=CommandGroup,
+    invoke_without_command=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    help="Look at a heap, find every object's 6D pose, move the camera where it helps most.\n\n"
+    "Example: [bold]active6d episode --object mug --seed 7 --policy lowest-score --bag bags/mug[/bold]",
+    epilog="ACTIVE6D_TRACEBACK=1 shows the full traceback of an error.",
+)
+
+
+@app.callback()
+def show_help(ctx: typer.Context) -> None:
+    """Without a command, help is what one wants."""
+    if ctx.invoked_subcommand is None:
+        typer.echo(ctx.get_help())
+
+
+app.command()(doctor.doctor)
+app.command()(episode.episode)
+app.command()(replay.replay)
+app.command()(report.report)
+app.command()(bank.bank)
+app.command()(evaluate.evaluate)
+app.command()(ablate.ablate)
+app.add_typer(objects.app, name="object")
+app.add_typer(scenes.app, name="scenes")
+benchmark.app.command()(estimator_benchmark.estimator)
+benchmark.app.command()(agent_benchmark.environment)
+benchmark.app.command()(agent_benchmark.pipeline)
+app.add_typer(benchmark.app, name="benchmark")
+estimator_training.app.command()(policy_training.policy)
+app.add_typer(estimator_training.app, name="train")
+
+
+def main() -> None:
+    """Entry point of the ``active6d`` executable."""
+    # ROS stays on this machine unless the user says otherwise: an episode is no business of the neighbours'.
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    sys.exit(app(prog_name="active6d"))

@@ -1,0 +1,56 @@
+"""``active6d benchmark graph``."""
+
+from typing import Annotated
+
+import typer
+
+from active6d_tools.cli.output import JsonFile, ObjectName, Seed, console, progress_bar, write_json
+
+app = typer.Typer(help="Measure speed and quality.", rich_markup_mode="rich")
+
+
+@app.callback()
+def benchmark() -> None:
+    """Measure speed and quality."""
+
+
+@app.command()
+def graph(
+    object_name: ObjectName = "mug",
+    seed: Seed = 0,
+    views: Annotated[int, typer.Option(min=2, help="Views of one episode.")] = 11,
+    hypotheses: Annotated[int, typer.Option(min=1, help="Hypotheses a view.")] = 20,
+    repeats: Annotated[int, typer.Option(min=1, help="Episodes; a view's time is their median.")] = 5,
+    json_file: JsonFile = None,
+) -> None:
+    """Compare the node graph with calling the core functions, and time verification and fusion.
+
+    Example: [bold]active6d benchmark graph --object mug --json graph.json[/bold]
+    """
+    from rich.table import Table
+
+    from active6d_core.object_model import load_object
+    from active6d_tools.benchmark.graph_overhead import measure_graph
+
+    load_object(object_name)
+    with progress_bar() as progress:
+        task = progress.add_task("rendering views", total=None)
+        result = measure_graph(
+            object_name,
+            seed=seed,
+            views=views,
+            hypotheses=hypotheses,
+            repeats=repeats,
+            on_progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
+        )
+    table = Table(box=None, pad_edge=False, title=f"{object_name}, {views} views, {hypotheses} hypotheses a view")
+    for column in ("", "ms a view", "beyond direct calls"):
+        table.add_column(column, justify="left" if not column else "right", header_style="dim")
+    table.add_row("core functions called directly", f"{result['direct_ms']:.2f}", "")
+    table.add_row("through the graph", f"{result['graph_ms']:.2f}", f"{result['overhead_ms']:.2f} ms")
+    table.add_row(
+        "through the graph, recorded", f"{result['recorded_ms']:.2f}", f"{result['overhead_recorded_ms']:.2f} ms"
+    )
+    table.add_row("verification and fusion, last view", f"{result['fusion_ms']:.2f}", f"{result['fusion_hz']:.0f} Hz")
+    console.print(table)
+    write_json(json_file, {"seed": seed, **result})

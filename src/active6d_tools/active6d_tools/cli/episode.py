@@ -1,0 +1,224 @@
+"""``active6d episode``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from active6d_tools.cli.output import (
+    JsonFile,
+    ObjectName,
+    Overrides,
+    ParamsFile,
+    Processes,
+    Seed,
+    console,
+    messages,
+    progress_bar,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from active6d_bringup.graph.episode import EpisodeResult, EpisodeSettings, EpisodeStep
+    from active6d_core.metrics import SceneScore
+
+
+def episode(
+    object_name: ObjectName = "mug",
+    seed: Seed = 0,
+    policy: Annotated[str, typer.Option(help="Who chooses the views.")] = "auto",
+    steps: Annotated[int, typer.Option(min=0, help="Budget of moves T; T moves are T + 1 images.")] = 5,
+    metres: Annotated[float | None, typer.Option(min=0.0, help="Budget of metres along the hemisphere.")] = None,
+    estimator: Annotated[str | None, typer.Option(help="Who finds poses in one view; the params file's.")] = None,
+    scene: Annotated[
+        str | None, typer.Option(metavar="NAME", help="A stored scene such as mug/test/3 instead of a heap by seed.")
+    ] = None,
+    bag: Annotated[Path | None, typer.Option(metavar="DIR", help="Record every topic into this new folder.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the HTML report of the bag; needs --bag.")
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Draw before and after, attention against scores, and the path; needs --bag."
+        ),
+    ] = None,
+    processes: Processes = False,
+    params_file: ParamsFile = None,
+    override: Overrides = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Let the graph look at a heap, think and move, once: the same seed gives the same episode.
+
+    Example: [bold]active6d episode --object mug --seed 7 --policy lowest-score --steps 5 --bag bags/mug[/bold]
+    """
+    if bag is None and (report is not None or figure is not None):
+        option = "--report" if report is not None else "--figure"
+        raise ValueError(f"{option} needs --bag, because it is made from what was recorded")
+    with messages.status("starting"):
+        from active6d_bringup.graph.episode import EpisodeSettings
+
+        settings = EpisodeSettings(
+            object=object_name,
+            seed=seed,
+            scene=scene,
+            policy=policy,
+            steps=steps,
+            metres=metres,
+            estimator=estimator,
+            bag=bag,
+            processes=processes,
+            params_file=params_file,
+            overrides=parse_overrides(override or []),
+        )
+        _check_names(settings)
+    result = _run(settings)
+    summary = _summary(result)
+    _print_summary(result, summary)
+    if report is not None or figure is not None:
+        from active6d_bringup.bags.reader import read_episode
+        from active6d_tools.cli.report import write_reports
+        from active6d_tools.report.analysis import analyse
+
+        write_reports(analyse(read_episode(bag)), report, figure=figure)
+    write_json(json_file, summary)
+
+
+def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
+    """``node.parameter=value`` texts to node, parameter and value, read as YAML like ROS does.
+
+    Raises:
+        ValueError: a text that is not of that form.
+    """
+    import yaml
+
+    overrides: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        node, dot, parameter = name.partition(".")
+        if not (equals and dot and node and parameter):
+            raise ValueError(f"--set {text}: expected NODE.NAME=VALUE, such as hypothesis_fusion.epsilon=0.01")
+        try:
+            overrides.setdefault(node, {})[parameter] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ValueError(f"--set {text}: the value is not YAML ({error})") from error
+    return overrides
+
+
+def _check_names(settings: "EpisodeSettings") -> None:
+    """Refuse wrong names before any node starts: a node's process could only say so in its log."""
+    from active6d_agent.policies.registry import list_policies
+    from active6d_core.object_model import load_object
+    from active6d_core.registry import AUTOMATIC
+    from active6d_perception.estimators.registry import list_estimators
+
+    load_object(settings.object)
+    for option, value, known in (
+        ("--policy", settings.policy, [AUTOMATIC, *list_policies()]),
+        ("--estimator", settings.estimator, [AUTOMATIC, *list_estimators()]),
+    ):
+        if value is not None and value not in known:
+            raise ValueError(f"{option} '{value}' is not among {', '.join(known)}")
+
+
+def _run(settings: "EpisodeSettings") -> "EpisodeResult":
+    """Run with a line a view and a bar; an episode that fails is one line and exit code 1."""
+    from rich.markup import escape
+
+    from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, run_episode
+    from active6d_bringup.graph.processes import ProcessError
+
+    with progress_bar() as progress:
+        task = progress.add_task("starting the nodes", total=settings.steps + 1)
+
+        def on_step(step: "EpisodeStep") -> None:
+            progress.update(task, advance=1, description=f"view {step.index}")
+            progress.console.print(_describe(step, settings.object), highlight=False, markup=False)
+
+        def on_event(text: str) -> None:
+            progress.update(task, description=escape(text))
+
+        try:
+            return run_episode(settings, on_step, on_event)
+        except (EpisodeError, ProcessError) as error:
+            failure, code = str(error), 1
+        except EpisodeInterrupted:
+            failure, code = "interrupted" + (f"; {settings.bag} holds what was recorded" if settings.bag else ""), 130
+    typer.echo(f"active6d: {failure}", err=True)
+    raise typer.Exit(code)
+
+
+def _describe(step: "EpisodeStep", object_name: str) -> str:
+    import numpy as np
+
+    x, y, z = step.T_world_camera[:3, 3]
+    azimuth, elevation = np.degrees([np.arctan2(y, x) % (2 * np.pi), np.arctan2(z, np.hypot(x, y))])
+    score = _score(step, object_name)
+    found = f"  found {score.detected.sum():2d}/{len(score.detected)}" if score else ""
+    return (
+        f"view {step.index:2d} at {azimuth:3.0f}° {elevation:2.0f}°  hypotheses {step.hypotheses:2d}  "
+        f"objects {len(step.objects):2d}{found}  {step.distance:5.2f} m"
+    )
+
+
+def _score(step: "EpisodeStep", object_name: str) -> "SceneScore | None":
+    if step.ground_truth is None or not len(step.ground_truth):
+        return None
+    from active6d_core.metrics import evaluate_scene
+    from active6d_core.object_model import load_object
+
+    return evaluate_scene(load_object(object_name), step.objects.T_world_object, step.ground_truth)
+
+
+def _summary(result: "EpisodeResult") -> dict[str, Any]:
+    """The numbers for JSON, all poses included, so that two episodes can be compared."""
+    last = _score(result.steps[-1], result.settings.object)
+    return {
+        "object": result.settings.object,
+        "scene": result.info.get("scene"),
+        "seed": result.settings.seed,
+        "policy": result.info.get("policy", result.settings.policy),
+        "moves": len(result.steps) - 1,
+        "end_reason": result.reason,
+        "distance_m": result.distance,
+        "seconds": result.seconds,
+        "objects_true": len(last.detected) if last else None,
+        "detection_rate": last.detection_rate if last else None,
+        "e_add_mm": last.mean_e_add_mm if last else None,
+        "events": result.events,
+        "steps": [
+            {
+                "stamp": step.stamp,
+                "T_world_camera": step.T_world_camera.tolist(),
+                "goal": None if step.goal is None else step.goal.tolist(),
+                "hypotheses": step.hypotheses,
+                "T_world_object": step.objects.T_world_object.tolist(),
+                "verification": step.objects.verification.tolist(),
+                "latency_ms": step.latency_ms,
+            }
+            for step in result.steps
+        ],
+    }
+
+
+def _print_summary(result: "EpisodeResult", summary: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(style="dim")
+    table.add_column()
+    moves = f"{summary['moves']} moves, {result.distance:.2f} m, {result.seconds:.1f} s"
+    table.add_row("episode", escape(f"{summary['scene'] or result.settings.object}, {summary['policy']}: {moves}"))
+    table.add_row("ended", escape(result.reason))
+    if summary["objects_true"] is None:
+        table.add_row("objects", str(len(result.objects)))
+    else:
+        found = f"{summary['detection_rate'] * summary['objects_true']:.0f} of {summary['objects_true']}"
+        table.add_row("found", f"{found} ({summary['detection_rate']:.0%}), mean e_ADD {summary['e_add_mm']:.1f} mm")
+    for event in result.events:
+        if not event.startswith("starting "):
+            table.add_row("event", escape(event))
+    if result.settings.bag is not None:
+        table.add_row("bag", escape(str(result.settings.bag)))
+    console.print(table)

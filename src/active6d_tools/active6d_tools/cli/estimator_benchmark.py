@@ -1,0 +1,153 @@
+"""``active6d benchmark estimator``."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from active6d_tools.cli.output import JsonFile, ObjectName, Seed, console, messages, progress_bar, write_json
+
+
+def estimator(
+    object_name: ObjectName = "mug",
+    names: Annotated[
+        list[str] | None, typer.Option("--estimator", help="Estimator; repeatable. All that know it by default.")
+    ] = None,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="Also OpenCV's PPF and FPFH with RANSAC; use --sample.")
+    ] = False,
+    split: Annotated[str, typer.Option(help="Which stored scenes.")] = "test",
+    sample: Annotated[int | None, typer.Option(min=1, help="That many views, drawn by --seed; all by default.")] = None,
+    noise: Annotated[
+        list[float] | None, typer.Option(min=0.0, help="Factor on the sensor's noise; repeatable. 1 by default.")
+    ] = None,
+    moves: Annotated[int, typer.Option(min=0, help="Also fuse this many moves a scene.")] = 0,
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of the dense estimator, instead of the shipped ones.")
+    ] = None,
+    records: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Keep every view's result here, and go on from what it holds.")
+    ] = None,
+    plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw the study of the scores as PNG.")] = None,
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+) -> None:
+    """Count what estimators find in single views, how right and how fast they are, and what their scores tell.
+
+    Example: [bold]active6d benchmark estimator --object mug --sample 50 --plots plots --json mug.json[/bold]
+    """
+    from active6d_core.object_model import load_object
+    from active6d_perception.estimators.registry import list_estimators, weights_path
+    from active6d_tools.benchmark.estimator_plots import draw_ambiguity, draw_verification
+    from active6d_tools.benchmark.estimator_views import enlist, measure_estimators
+
+    model = load_object(object_name)
+    # The learned one takes part for objects that it has learned.
+    able = [name for name in list_estimators() if name != "dense" or (weights or weights_path(object_name)).is_file()]
+    with progress_bar() as progress:
+        task = progress.add_task("loading", total=None)
+        contenders = enlist(model, names or able, weights=weights, peers=peers)
+        measured = measure_estimators(
+            object_name,
+            split,
+            contenders,
+            sample=sample,
+            moves=moves,
+            seed=seed,
+            noises=tuple(dict.fromkeys(noise or [1.0])),
+            records=records,
+            on_progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
+        )
+    part = " or ".join(model.features)
+    for factor, rows in measured.document["noise"].items():
+        title = f"{object_name}, {split}, {measured.document['views']} views, noise x{factor}"
+        for table in (_rates(title, rows, part), _details(rows, part)):
+            console.print(table)
+            console.print()
+    console.print(f"peak memory of the process {measured.document['peak_memory_mib']:.0f} MiB", highlight=False)
+    write_json(json_file, measured.document)
+    for (factor, name), result in measured.results.items() if plots else ():
+        ending = f"{object_name}_{name}_noise{factor:g}.png"
+        title = f"{object_name}, {split}, {name}, noise x{factor:g}, {len(result.views)} views"
+        draw_verification(plots / f"verification_{ending}", title, result)
+        if model.features:
+            draw_ambiguity(plots / f"ambiguity_{ending}", title, model, result)
+        messages.print(f"wrote {plots}/*_{ending}", highlight=False)
+
+
+def _rates(title: str, rows: dict[str, dict[str, Any]], part: str) -> Table:
+    """Shares found by visible fraction with their 95 % intervals, and precision; ``part`` is what tells the turn."""
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
+    table.add_column("detection at 10 %", header_style="dim", no_wrap=True)
+    for column in ("e_ADD ≥half", "≥tenth", "ADD-S ≥half", "≥tenth", "precision"):
+        table.add_column(column, justify="right", header_style="dim")
+    for name, row in rows.items():
+        cells = [_interval(row[kind][least]) for kind in ("add", "adds") for least in ("0.5", "0.1")]
+        table.add_row(name, *cells, _interval(row["precision"]))
+        if "feature_seen" in row:
+            seen = row["feature_seen"]
+            cells = [_interval(seen[kind][least]) for kind in ("add", "adds") for least in ("0.5", "0.1")]
+            table.add_row(f"  {part} seen", *cells, "")
+    return table
+
+
+def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
+    """BOP's recalls and precisions, what the scores tell, times; a column an estimator."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("", no_wrap=True)
+    for name in rows:
+        table.add_column(name, justify="right", header_style="dim")
+
+    def add(label: str, cell) -> None:
+        table.add_row(label, *(cell(row) for row in rows.values()))
+
+    for kind in ("mssd", "mspd"):
+        add(f"average recall, {kind.upper()}", lambda row, kind=kind: _interval(row[kind]["average_recall"]))
+    for least in next(iter(rows.values()))["recall_at_precision"]:
+        add(f"found at precision {least}", lambda row, least=least: _number(row["recall_at_precision"][least]))
+    for kind, label in (("pose", "10 % of the diameter"), ("mssd", "MSSD"), ("mspd", "MSPD")):
+        add(f"average precision, {label}", lambda row, kind=kind: _number(row["average_precision"][kind]))
+    _add_scores(add)
+    if all("ambiguity" in row for row in rows.values()):
+        for where in ("seen", "hidden"):
+            add(f"right turn, {part} {where}", lambda row, where=where: _number(row["ambiguity"][where]["right_turn"]))
+        add("right from wrong turn, area under the curve", lambda row: _number(row["ambiguity"]["auc"]))
+    _add_times(add, rows)
+    if any("fused" in row for row in rows.values()):
+        add(
+            "all objects, e_ADD: one view, fused",
+            lambda row: f"{row['fused'][0]:.2f}, {row['fused'][-1]:.2f}" if "fused" in row else "-",
+        )
+    return table
+
+
+def _add_scores(add: Callable) -> None:
+    for kind, label in (("equation_1", "verification"), ("own_score", "own score")):
+        for measure, text in (("auc_adds", "area under the curve"), ("spearman_add", "rank correlation, e_ADD")):
+            add(f"{label}, {text}", lambda row, kind=kind, measure=measure: _number(row["verification"][kind][measure]))
+
+
+def _add_times(add: Callable, rows: dict[str, dict[str, Any]]) -> None:
+    crowded = all("crowded" in row["time"] for row in rows.values())
+    for which, label in (("all", "all views"), *([("crowded", "14 objects or more")] if crowded else [])):
+        for key, clock in (("total", "ms"), ("cpu", "CPU ms")):
+            add(f"{clock}, {label}: median (95 %)", lambda row, which=which, key=key: _time(row["time"][which], key))
+    which = "crowded" if crowded else "all"
+    for stage in dict.fromkeys(stage for row in rows.values() for stage in row["time"][which]["stages"]):
+        add(f"  {stage}", lambda row, stage=stage: _time(row["time"][which]["stages"], stage))
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _interval(rate: dict[str, Any]) -> str:
+    if rate["rate"] is None:
+        return "-"
+    return f"{rate['rate']:.3f}\n[dim]{rate['low']:.2f}-{rate['high']:.2f}[/dim]"  # narrow enough for 80 columns
+
+
+def _time(times: dict[str, Any], key: str) -> str:
+    return f"{times[key]['median_ms']:.0f} ({times[key]['p95_ms']:.0f})" if key in times else "-"

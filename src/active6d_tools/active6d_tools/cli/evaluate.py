@@ -1,0 +1,139 @@
+"""``active6d evaluate``: the paper's Table 1 on a scene bank."""
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from active6d_tools.cli.bank import Banks
+from active6d_tools.cli.output import JsonFile, ObjectName, Seed, console, messages, progress_bar, write_json
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+#: In the table's order.
+ALL_POLICIES = (
+    *("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score", "attention"),
+    *("view-attention", "oracle", "all-views"),
+)
+#: What the others are compared with in a table of its own.
+_DEFAULT = "view-attention"
+Policies = Annotated[str, typer.Option(help="Names separated by commas, or all; oracle and all-views are bounds.")]
+Sample = Annotated[int | None, typer.Option(min=1, help="That many starts, drawn by --seed; all of them by default.")]
+
+
+def evaluate(
+    object_name: ObjectName = "mug",
+    policies: Policies = "all",
+    steps: Annotated[int, typer.Option(min=1, help="Budget of moves T; T moves are T + 1 views.")] = 5,
+    split: Annotated[str, typer.Option(help="Which bank: train, val or test.")] = "test",
+    sample: Sample = None,
+    override: Annotated[
+        list[str] | None, typer.Option("--set", metavar="POLICY.NAME=VALUE", help="A policy's parameter; repeatable.")
+    ] = None,
+    banks: Banks = None,
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+) -> None:
+    """Run every policy from the same scenes and starting views: e_ADD, detection rate and metres, with intervals.
+
+    Example: [bold]active6d evaluate --object mug --policies all --steps 5 --json mug.json[/bold]
+    """
+    from active6d_agent.bank.batched_fusion import BatchedFusion
+    from active6d_agent.bank.scene_bank import find_bank, load_bank
+    from active6d_agent.evaluation.policy_evaluation import all_starts, summarise
+    from active6d_agent.evaluation.policy_evaluation import evaluate as run_all
+    from active6d_sim.scenes.scene_store import SPLITS
+    from active6d_tools.cli.episode import parse_overrides
+
+    if split not in SPLITS:
+        raise ValueError(f"--split '{split}' is not among {', '.join(SPLITS)}")
+    bank = load_bank(find_bank(object_name, split, banks))
+    if steps >= len(bank.sphere):
+        raise ValueError(f"--steps {steps}: the grid of {len(bank.sphere)} views leaves {len(bank.sphere) - 1} moves")
+    parameters = parse_overrides(override or [])
+    names = usable_policies(policies, bank, parameters)
+    with messages.status("reading the bank"):
+        lookup = BatchedFusion(bank)
+    starts = all_starts(lookup, sample, seed)
+    with progress_bar() as progress:
+        task = progress.add_task("evaluating", total=len(names) * len(starts))
+
+        def on_progress(name: str, episodes: int) -> None:
+            progress.update(task, description=name, advance=episodes)
+
+        running = run_all(lookup, names, steps, starts, seed=seed, parameters=parameters, on_progress=on_progress)
+        results = dict(running)
+    summary = summarise(results, object_name, steps, seed)
+    console.print(_table(summary))
+    if _DEFAULT in results and len(results) > 1:
+        console.print(_differences(summary))
+    provenance = {"split": split, "seed": seed, "bank": bank.provenance, "parameters": parameters}
+    write_json(json_file, {**summary, **provenance})
+
+
+def usable_policies(text: str, bank: Any, parameters: dict[str, dict]) -> list[str]:
+    """Names out of a comma-separated list; ``all`` leaves out, with a note, policies whose weights are missing.
+
+    Raises:
+        ValueError: an unknown name, a wrong parameter, or a policy asked for by name that has no weights.
+    """
+    from active6d_agent.evaluation.policy_evaluation import BOUNDS
+    from active6d_agent.policies.registry import create_policy
+
+    names = list(ALL_POLICIES) if text == "all" else [name.strip() for name in text.split(",")]
+    usable = []
+    for name in names:
+        try:
+            if name not in BOUNDS:
+                own = {"entropy": bank.scenes[0].entropy} if name == "entropy" else {}
+                create_policy(name, bank.model, **{**own, **parameters.get(name, {})})
+        except ValueError as error:
+            if text != "all" or name in parameters:
+                raise
+            messages.print(f"left out: {error}", highlight=False, markup=False)
+            continue
+        usable.append(name)
+    unknown = sorted(parameters.keys() - set(usable))
+    if unknown:
+        raise ValueError(f"--set {unknown[0]}: no such policy among {', '.join(usable)}")
+    return usable
+
+
+def _table(summary: dict[str, Any]) -> "Table":
+    from rich.table import Table
+
+    title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
+    table = Table(box=None, pad_edge=False, title=title)
+    table.add_column("policy", header_style="dim", no_wrap=True, min_width=max(map(len, summary["policies"])))
+    for column in ("d, m", "e_ADD, mm", "", "detected", "", "gap closed"):
+        table.add_column(column, justify="right", header_style="dim")
+    for name, row in summary["policies"].items():
+        error, rate, gap = row["e_add_mm_ci95_scenes"], row["detection_rate_ci95_scenes"], row["gap_closed"]
+        table.add_row(
+            name,
+            f"{row['distance_m']:.2f}",
+            f"{row['e_add_mm']:.2f}",
+            f"[dim]{error[0]:.2f}-{error[1]:.2f}[/dim]",
+            f"{row['detection_rate']:.3f}",
+            f"[dim]{rate[0]:.3f}-{rate[1]:.3f}[/dim]",
+            "-" if gap is None else f"{gap:.0%}",
+        )
+    return table
+
+
+def _differences(summary: dict[str, Any]) -> "Table":
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, title=f"{_DEFAULT} against the others, by the same starts")
+    against = summary["policies"][_DEFAULT]["against"]
+    table.add_column("against", header_style="dim", no_wrap=True, min_width=max(map(len, against)))
+    for column in ("d, m", "e_ADD, mm", "", "detected", ""):
+        table.add_column(column, justify="right", header_style="dim")
+    for name, measured in against.items():
+        cells = [f"{measured['distance_m']['mean']:+.2f}"]
+        for key, digits in (("e_add_mm", 2), ("detection_rate", 3)):
+            low, high = (f"{end:+.{digits}f}" for end in measured[key]["ci95_scenes"])
+            style = "bold" if measured[key]["excludes_zero_scenes"] else "dim"
+            cells += [f"[{style}]{measured[key]['mean']:+.{digits}f}[/]", f"[dim]{low} {high}[/dim]"]
+        table.add_row(name, *cells)
+    return table

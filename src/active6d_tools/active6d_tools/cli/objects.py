@@ -1,0 +1,166 @@
+"""``active6d object list|show|add``."""
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from active6d_tools.cli.output import JsonFile, console, messages, write_file, write_json
+
+if TYPE_CHECKING:
+    from active6d_core.object_model import ObjectModel
+
+app = typer.Typer(help="Object models: list, show, add.", rich_markup_mode="rich")
+
+
+@app.command("list")
+def list_models(json_file: JsonFile = None) -> None:
+    """List every object that can fill a bin.
+
+    Example: [bold]active6d object list[/bold]
+    """
+    from rich.markup import escape
+    from rich.table import Table
+
+    from active6d_core.object_model import list_objects, load_object
+
+    rows = [_describe(load_object(name)) for name in list_objects()]
+    table = Table(box=None, pad_edge=False)
+    for column in ("name", "diameter", "symmetry", "instances", "triangles", "features"):
+        table.add_column(column, header_style="dim", justify="left" if column in ("name", "symmetry") else "right")
+    for row in rows:
+        low, high = row["instances"]
+        table.add_row(
+            escape(row["name"]),
+            f"{row['diameter_mm']:.1f} mm",
+            row["symmetry"],
+            f"{low}-{high}",
+            f"{row['triangles']:,}",
+            escape(", ".join(row["features"]) or "-"),
+        )
+    console.print(table)
+    write_json(json_file, {"objects": rows})
+
+
+@app.command()
+def show(
+    name: Annotated[str, typer.Argument(help="Name of the object.")],
+    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Render the object from four sides.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Say what is known of an object, and render it.
+
+    Example: [bold]active6d object show mug --png mug.png[/bold]
+    """
+    from active6d_core.object_model import load_object
+
+    model = load_object(name)
+    description = _describe(model)
+    for key, value in description.items():
+        console.print(f"[dim]{key.replace('_', ' '):13}[/dim]", end="")
+        console.print(f" {value}", markup=False, highlight=False)
+    if png is not None:
+        with messages.status("rendering"):
+            write_file(png, _render(model))
+        messages.print(f"wrote {png}", highlight=False, markup=False)
+    write_json(json_file, description)
+
+
+@app.command()
+def add(
+    mesh: Annotated[Path, typer.Argument(help="Triangle mesh: ply, stl, obj, off or glb; normals outwards.")],
+    name: Annotated[str, typer.Option(help="Name of the new object.")],
+    scale: Annotated[float, typer.Option(help="The mesh's unit in metres: 0.001 for millimetres.")] = 1.0,
+    axis: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="Axis of a continuous symmetry, in the mesh's frame.")
+    ] = None,
+    instances: Annotated[tuple[int, int], typer.Option(help="Fewest and most instances in a scene.")] = (8, 14),
+    color: Annotated[tuple[float, float, float], typer.Option(help="Red, green, blue, from 0 to 1.")] = (
+        0.6,
+        0.6,
+        0.62,
+    ),
+    into: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the description and the mesh.")] = Path(
+        "objects"
+    ),
+) -> None:
+    """Add an object: copy its mesh and write its description beside it.
+
+    Example: [bold]active6d object add bracket.stl --name bracket --scale 0.001 --into objects[/bold]
+    """
+    import os
+
+    import yaml
+
+    from active6d_core.object_model import read_description
+
+    if not name.replace("_", "").replace("-", "").isalnum():
+        raise ValueError(f"--name '{name}': use letters, digits, - and _")
+    if not mesh.is_file():
+        raise ValueError(f"mesh {mesh} does not exist")
+    description_path, mesh_path = into / f"{name}.yaml", into / "meshes" / f"{name}{mesh.suffix.lower()}"
+    for path in (description_path, mesh_path):
+        if path.exists():
+            raise ValueError(f"{path} exists already; choose another --name or remove it")
+    description = {"name": name, "mesh": f"meshes/{mesh_path.name}", "scale": scale}
+    if axis is not None:
+        description["symmetry"] = {"axis": list(axis)}
+    description |= {"instances": list(instances), "color": list(color), "source": mesh.name}
+    mesh_path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(mesh, mesh_path)
+    try:
+        write_file(description_path, yaml.safe_dump(description, sort_keys=False))
+        model = read_description(description_path)
+    except Exception as error:  # readers of meshes raise many kinds on damaged files
+        description_path.unlink(missing_ok=True)
+        mesh_path.unlink()
+        raise ValueError(f"{mesh} cannot be added: {error}") from error
+    console.print(f"added {name}: {1e3 * model.diameter:.1f} mm in diameter", highlight=False, markup=False)
+    folders = os.environ.get("ACTIVE6D_OBJECT_PATH", "").split(os.pathsep)
+    if str(into) not in folders and str(into.resolve()) not in folders:
+        console.print(f"export ACTIVE6D_OBJECT_PATH={into.resolve()}", highlight=False, markup=False)
+
+
+def _describe(model: "ObjectModel") -> dict:
+    symmetry = "about an axis" if model.symmetry.axis is not None else "none"
+    if len(model.symmetry.discrete) > 1:
+        symmetry = f"{len(model.symmetry.discrete)} rotations" + (", about an axis" if symmetry != "none" else "")
+    return {
+        "name": model.name,
+        "diameter_mm": round(1e3 * model.diameter, 2),
+        "size_mm": (1e3 * model.mesh.extents).round(2).tolist(),
+        "volume_ml": round(1e6 * float(model.mesh.volume), 2),
+        "symmetry": symmetry,
+        "instances": list(model.instances),
+        "triangles": len(model.mesh.faces),
+        "features": sorted(model.features),
+    }
+
+
+def _render(model: "ObjectModel") -> bytes:
+    """PNG of the object on a plate from four sides, 30 degrees above the horizon."""
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    from active6d_core.camera import PinholeCamera
+    from active6d_core.se3 import look_at, make_transform
+    from active6d_sim.rendering.renderer import SceneRenderer
+    from active6d_sim.scenes.scene import Bin, Scene
+
+    height = -float(model.mesh.bounds[0, 2])
+    plate = Bin(2.2 * model.diameter, 2.2 * model.diameter, 0.0)
+    pose = make_transform(np.eye(3), (0.0, 0.0, height))[None]
+    renderer = SceneRenderer(Scene(model.name, f"{model.name}/show", 0, pose, plate, np.zeros((0, 1))))
+    camera = PinholeCamera.from_field_of_view(420, 420, 30.0)
+    target = np.array([0.0, 0.0, height])
+    pictures = []
+    for azimuth in np.radians((-60.0, 30.0, 120.0, 210.0)):
+        toward = np.array([np.cos(azimuth), np.sin(azimuth), 0.58])
+        eye = target + 3.0 * model.diameter * toward / np.linalg.norm(toward)
+        pictures.append(renderer.render(look_at(eye, target), camera).color)
+    buffer = io.BytesIO()
+    Image.fromarray(np.hstack(pictures)).save(buffer, "PNG")
+    return buffer.getvalue()

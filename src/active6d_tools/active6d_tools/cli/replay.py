@@ -1,0 +1,120 @@
+"""``active6d replay``."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from active6d_tools.cli.episode import parse_overrides
+from active6d_tools.cli.output import (
+    BagFolder,
+    BagObject,
+    JsonFile,
+    Overrides,
+    ParamsFile,
+    Processes,
+    console,
+    progress_bar,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from active6d_bringup.bags.replay import ReplayResult, ReplaySettings
+
+
+def replay(
+    folder: BagFolder,
+    rate: Annotated[float, typer.Option(min=1e-3, help="Speed against the recording's.")] = 1.0,
+    as_fast: Annotated[
+        bool, typer.Option("--as-fast", help="Send a view as soon as the objects of the last one are there.")
+    ] = False,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Exit with 1 unless hypotheses and objects equal the recorded ones.")
+    ] = False,
+    object_name: BagObject = None,
+    estimator: Annotated[str | None, typer.Option(help="Another estimator than the recorded one.")] = None,
+    processes: Processes = False,
+    params_file: ParamsFile = None,
+    override: Overrides = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Send a bag's camera through live perception.
+
+    Example: [bold]active6d replay bags/mug --as-fast --compare[/bold]
+    """
+    if as_fast and rate != 1.0:
+        raise ValueError("--rate and --as-fast exclude each other")
+    from active6d_bringup.bags.replay import ReplaySettings
+
+    settings = ReplaySettings(
+        bag=folder,
+        rate=0.0 if as_fast else rate,
+        object=object_name,
+        estimator=estimator,
+        processes=processes,
+        params_file=params_file,
+        overrides=parse_overrides(override or []),
+    )
+    result = _run(settings)
+    console.print(f"{result.views} views in {result.seconds:.1f} s", highlight=False)
+    if compare:
+        _print_comparison(result)
+    write_json(json_file, _summary(result))
+    if compare and not result.equal:
+        raise typer.Exit(1)
+
+
+def _run(settings: "ReplaySettings") -> "ReplayResult":
+    from active6d_bringup.bags.replay import replay as run_replay
+    from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted
+    from active6d_bringup.graph.processes import ProcessError
+
+    with progress_bar() as progress:
+        task = progress.add_task("starting the nodes", total=None)
+        try:
+            return run_replay(
+                settings,
+                lambda done, total: progress.update(task, completed=done, total=total, description="replaying"),
+            )
+        except (EpisodeError, ProcessError) as error:
+            failure, code = str(error), 1
+        except EpisodeInterrupted:
+            failure, code = "interrupted", 130
+    typer.echo(f"active6d: {failure}", err=True)
+    raise typer.Exit(code)
+
+
+def _print_comparison(result: "ReplayResult") -> None:
+    if result.equal:
+        console.print("[green]equal[/green]: every view's hypotheses, masks, objects and surface are the recorded ones")
+        return
+    views = {comparison.stamp for comparison in result.comparisons if not comparison.equal}
+    console.print(f"[red]different[/red] in {len(views)} of {result.views} views")
+    missing = sorted({comparison.topic for comparison in result.comparisons if comparison.recorded is None})
+    if missing:
+        console.print(f"the bag lacks messages of {', '.join(missing)}", highlight=False)
+    for name, difference in result.largest_differences().items():
+        text = "other sizes" if difference != difference else f"{difference:.3g} at most"
+        console.print(f"  {name}: {text}", highlight=False, markup=False)
+
+
+def _summary(result: "ReplayResult") -> dict:
+    return {
+        "views": result.views,
+        "seconds": result.seconds,
+        "equal": result.equal,
+        "messages": [
+            {
+                "stamp": comparison.stamp,
+                "topic": comparison.topic,
+                "recorded": comparison.recorded,
+                "live": comparison.live,
+                "equal": comparison.equal,
+            }
+            for comparison in result.comparisons
+        ],
+        # JSON has no NaN, which stands for sizes that differ.
+        "largest_differences": {
+            name: None if difference != difference else difference
+            for name, difference in result.largest_differences().items()
+        },
+    }

@@ -1,0 +1,104 @@
+"""``active6d report``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from active6d_tools.cli.output import (
+    BagFolder,
+    BagObject,
+    JsonFile,
+    console,
+    messages,
+    write_file,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from active6d_tools.report.analysis import EpisodeAnalysis
+
+
+def report(
+    folder: BagFolder,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="The HTML file; DIR/report.html by default.")
+    ] = None,
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the views and how the score rose, as one picture.")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw before and after, attention against scores, and the path.")
+    ] = None,
+    object_name: BagObject = None,
+    episode: Annotated[int, typer.Option(min=0, help="Which episode of a bag with several, from 0.")] = 0,
+    json_file: JsonFile = None,
+) -> None:
+    """Make one self-contained HTML file of a recorded episode, and say the same in short here.
+
+    Example: [bold]active6d report bags/mug -o mug.html --figure mug.png[/bold]
+    """
+    from active6d_bringup.bags.reader import read_episodes
+    from active6d_tools.report.analysis import analyse
+
+    with messages.status("reading the bag"):
+        records = read_episodes(folder)
+        if episode >= len(records):
+            raise ValueError(f"--episode {episode}: {folder} holds {len(records)}, counted from 0")
+        analysis = analyse(records[episode], object_name)
+    write_reports(analysis, output or folder / "report.html", png, figure)
+    print_summary(analysis)
+    write_json(json_file, analysis.summary())
+
+
+def write_reports(
+    analysis: "EpisodeAnalysis", html: Path | None = None, png: Path | None = None, figure: Path | None = None
+) -> None:
+    """Write what has a path: the HTML page, the picture of all views, the figure of before, after and attention.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    from active6d_tools.report.figure import render_png
+    from active6d_tools.report.page import render_html
+    from active6d_tools.report.qualitative import render_qualitative
+
+    for path, render in ((html, render_html), (png, render_png), (figure, render_qualitative)):
+        if path is not None:
+            with messages.status(f"drawing {path.name}"):
+                write_file(path, render(analysis))
+            messages.print(f"wrote {path}", highlight=False, markup=False)
+
+
+def print_summary(analysis: "EpisodeAnalysis") -> None:
+    """The report in short: a line per view, then the totals."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    record, last = analysis.record, analysis.steps[-1]
+    known = last.truth is not None
+    title = "  ".join(part for part in (record.scene or analysis.model.name, record.policy) if part)
+    table = Table(box=None, pad_edge=False, title=escape(title), title_justify="left", title_style="bold")
+    columns = ["view", "camera", "moved", "hypotheses", "objects", "attends to"]
+    for column in [*columns, *(["found", "e_ADD"] if known else [])]:
+        table.add_column(column, justify="right", header_style="dim", no_wrap=True)
+    for step in analysis.steps:
+        truth = step.truth
+        attended = f"#{step.attended.index} ({step.attended.verification:.2f})" if step.attended else "-"
+        scored = [f"{truth.detected.sum()}/{len(truth.detected)}", f"{truth.mean_e_add_mm:.1f} mm"] if truth else []
+        table.add_row(
+            str(step.number),
+            f"{step.azimuth:.0f}° {step.elevation:2.0f}°",
+            f"{step.moved_m:.2f} m",
+            str(step.hypothesis_count),
+            str(len(step.rows)),
+            attended,
+            *scored,
+        )
+    console.print(table)
+    found = f"found {last.truth.detected.sum()} of {len(last.truth.detected)} objects, " if known else ""
+    error = f"mean e_ADD {last.truth.mean_e_add_mm:.1f} mm, " if known else f"{len(last.rows)} objects, "
+    console.print(f"{found}{error}{analysis.distance_m:.2f} m in {len(analysis.steps) - 1} moves", highlight=False)
+    times = ", ".join(f"{time.node} {time.median_ms:.1f} ms" for time in analysis.node_times)
+    if times:
+        console.print(f"median per view: {times}", style="dim", highlight=False, markup=False)

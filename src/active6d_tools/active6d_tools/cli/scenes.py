@@ -1,0 +1,144 @@
+"""``active6d scenes generate|report|show``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from active6d_tools.cli.output import (
+    JsonFile,
+    ObjectName,
+    Seed,
+    console,
+    messages,
+    progress_bar,
+    write_file,
+    write_json,
+)
+
+app = typer.Typer(help="Stored scenes: generate, report, show.", rich_markup_mode="rich")
+
+
+@app.command()
+def generate(
+    object_name: ObjectName = "mug",
+    into: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the stored scenes.")] = Path("scenes"),
+    split: Annotated[list[str] | None, typer.Option(help="train, val or test; repeatable. All by default.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one a core by default.")] = None,
+) -> None:
+    """Drop the heaps of every split and store those that are not there yet; their seeds are fixed.
+
+    Example: [bold]active6d scenes generate --object mug --into scenes[/bold]
+    """
+    import os
+
+    from active6d_sim.scenes.scene_store import SPLITS
+    from active6d_sim.scenes.scene_store import generate as store_scenes
+
+    splits = tuple(split or SPLITS)
+    with progress_bar() as progress:
+        total = sum(SPLITS.get(name, 0) for name in splits)
+        there = sum(1 for name in splits for _ in (into / object_name).glob(f"{name}_??.npz"))
+        task = progress.add_task(f"dropping {object_name}", total=total, completed=there)
+        for path in store_scenes(object_name, into, splits=splits, workers=workers):
+            progress.update(task, advance=1, description=path.stem)
+    console.print(f"{total} scenes in {into / object_name}", highlight=False, markup=False)
+    if str(into.resolve()) not in os.environ.get("ACTIVE6D_SCENE_PATH", "").split(os.pathsep):
+        console.print(f"export ACTIVE6D_SCENE_PATH={into.resolve()}", highlight=False, markup=False)
+
+
+@app.command()
+def report(
+    object_name: ObjectName = "mug",
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    moves: Annotated[int, typer.Option(min=0, help="T; T + 1 views are taken.")] = 5,
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+) -> None:
+    """Say how much the choice of views matters: shares of objects that some view shows at least half of.
+
+    Example: [bold]active6d scenes report --object mug --split test[/bold]
+    """
+    import numpy as np
+    from rich.table import Table
+
+    from active6d_core.object_model import load_object
+    from active6d_sim.scenes.scene_store import SPLITS, density_report, load_scene
+
+    load_object(object_name)
+    scenes = [load_scene(object_name, split, index) for index in range(SPLITS.get(split, 1))]
+    counts = [len(scene) for scene in scenes]
+    shares = density_report(scenes, np.random.default_rng(seed), moves=moves)
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(style="dim")
+    table.add_column(justify="right")
+    table.add_row("scenes", str(len(scenes)))
+    table.add_row("objects a scene", f"{min(counts)}-{max(counts)}")
+    titles = {
+        "one_view": "one view",
+        "random": f"{moves + 1} random views",
+        "revolution": f"{moves + 1} views around at 45°",
+        "oracle": f"{moves + 1} views of a greedy oracle",
+        "all_views": "all views",
+    }
+    for key, title in titles.items():
+        table.add_row(title, f"{shares[key]:.3f}")
+    console.print(table)
+    write_json(
+        json_file, {"object": object_name, "split": split, "moves": moves, "seed": seed, "counts": counts, **shares}
+    )
+
+
+@app.command()
+def show(
+    scene_name: Annotated[str, typer.Argument(metavar="NAME", help="Such as mug/test/3 or mug/seed/7.")],
+    png: Annotated[Path, typer.Option(metavar="FILE", help="Where to write the picture.")] = Path("scene.png"),
+    view: Annotated[
+        list[int] | None, typer.Option(min=0, help="View of the grid; repeatable. Four around by default.")
+    ] = None,
+    noise: Annotated[float, typer.Option(min=0.0, help="Factor on the sensor's noise.")] = 1.0,
+    seed: Seed = 0,
+) -> None:
+    """Draw a scene as the camera sees it: colour above, depth below.
+
+    Example: [bold]active6d scenes show mug/test/3 --png scene.png[/bold]
+    """
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    from active6d_core.object_model import load_object
+    from active6d_core.view_sphere import ViewSphere
+    from active6d_sim.rendering.sensor import SensorNoise
+    from active6d_sim.rendering.simulator import Simulator
+    from active6d_sim.scenes.scene_store import find_scene
+    from active6d_tools.report.drawing import depth_to_color
+
+    sphere = ViewSphere()
+    views = view or [40, 45, 50, 55]
+    if max(views) >= len(sphere):
+        raise ValueError(f"--view {max(views)}: the grid has views 0 to {len(sphere) - 1}")
+    parts = scene_name.split("/")
+    if len(parts) != 3 or not parts[2].isdecimal():
+        raise ValueError(f"scene '{scene_name}' is not of the form mug/test/3 or mug/seed/7")
+    object_name, kind, number = parts
+    load_object(object_name)
+    with messages.status("dropping and rendering"):
+        scene = find_scene(object_name, "" if kind == "seed" else scene_name, int(number) if kind == "seed" else seed)
+        simulator = Simulator(scene, noise=SensorNoise().scaled(noise), seed=seed)
+        columns = []
+        for index in views:
+            image = simulator.capture(sphere.pose(sphere.positions[index]), (index + 1) * 1_000_000_000)
+            columns.append(np.vstack([image.color, depth_to_color(image.depth)[0]]))
+        buffer = io.BytesIO()
+        Image.fromarray(np.hstack(columns)).save(buffer, "PNG")
+        write_file(png, buffer.getvalue())
+    for index in views:
+        fraction = scene.visible_fraction[index]
+        shown = f"{(fraction >= 0.5).sum()} of {len(scene)} objects at least half visible"
+        azimuth, elevation = np.degrees(sphere.angles(sphere.positions[index]))
+        console.print(
+            f"view {index:2d}   azimuth {azimuth % 360:3.0f}°   elevation {elevation:2.0f}°   {shown}", highlight=False
+        )
+    messages.print(f"wrote {png}", highlight=False, markup=False)

@@ -1,0 +1,202 @@
+"""What an episode's record says, in numbers: scores against the truth where the bag has it, distances, times."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from active6d_bringup.bags.reader import EpisodeRecord, RecordedStep
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.metrics import DETECTION_FRACTION, SceneScore, evaluate_scene
+from active6d_core.object_model import ObjectModel, list_objects, load_object
+from active6d_core.view_sphere import ViewSphere
+
+
+@dataclass(frozen=True)
+class ObjectRow:
+    """One accumulated object at one step; attention and error are None where nothing is known of them."""
+
+    index: int
+    verification: float
+    score: float
+    support: int
+    spread_mm: float
+    attention: float | None
+    attended: bool
+    e_add_mm: float | None
+    detected: bool
+
+
+@dataclass(frozen=True, eq=False)
+class StepAnalysis:
+    """One view of the episode.
+
+    Attributes:
+        number: from 0, the view before the first move.
+        record: what the bag has of it.
+        objects: what was accumulated up to this view; empty where the bag has none.
+        rows: one per object, in their order.
+        truth: the scene's score, None without ground truth.
+        azimuth: degrees of the camera, in [0, 360).
+        elevation: degrees of the camera above the horizon.
+        moved_m: metres of arc since the last view.
+        total_m: metres of arc since the first view.
+    """
+
+    number: int
+    record: RecordedStep
+    objects: SceneObjects
+    rows: list[ObjectRow]
+    truth: SceneScore | None
+    azimuth: float
+    elevation: float
+    moved_m: float
+    total_m: float
+
+    @property
+    def hypothesis_count(self) -> int:
+        """Hypotheses that the estimator had for this view alone."""
+        return len(self.record.hypotheses) if self.record.hypotheses is not None else 0
+
+    @property
+    def attended(self) -> ObjectRow | None:
+        """The object that the policy attended to, None where it attended to none."""
+        return next((row for row in self.rows if row.attended), None)
+
+
+@dataclass(frozen=True)
+class NodeTime:
+    """How long a node worked on a view, in milliseconds, from its diagnostics."""
+
+    node: str
+    views: int
+    median_ms: float
+    longest_ms: float
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeAnalysis:
+    """An episode in numbers.
+
+    Attributes:
+        model: of the object that the heap is made of.
+        record: the episode itself.
+        sphere: the hemisphere that the camera moved on.
+        steps: one per view, in order.
+        node_times: slowest node first.
+    """
+
+    model: ObjectModel
+    record: EpisodeRecord
+    sphere: ViewSphere
+    steps: list[StepAnalysis]
+    node_times: list[NodeTime]
+
+    @property
+    def distance_m(self) -> float:
+        """Metres along the hemisphere (the paper's d)."""
+        return self.steps[-1].total_m
+
+    @property
+    def threshold_mm(self) -> float:
+        """An object is detected below this e_ADD."""
+        return 1e3 * DETECTION_FRACTION * self.model.diameter
+
+    def summary(self) -> dict:
+        """The numbers for JSON."""
+        known = self.record.ground_truth is not None
+        return {
+            "object": self.model.name,
+            "scene": self.record.scene,
+            "seed": self.record.seed,
+            "policy": self.record.policy,
+            "end_reason": self.record.end_reason,
+            "objects_true": len(self.record.ground_truth) if known else None,
+            "distance_m": self.distance_m,
+            "steps": [
+                {
+                    "stamp": step.record.stamp,
+                    "azimuth_degrees": step.azimuth,
+                    "elevation_degrees": step.elevation,
+                    "moved_m": step.moved_m,
+                    "hypotheses": step.hypothesis_count,
+                    "objects": len(step.rows),
+                    "detection_rate": step.truth.detection_rate if step.truth else None,
+                    "e_add_mm": step.truth.mean_e_add_mm if step.truth else None,
+                }
+                for step in self.steps
+            ],
+            "node_times": {
+                time.node: {"median_ms": time.median_ms, "longest_ms": time.longest_ms} for time in self.node_times
+            },
+        }
+
+
+def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAnalysis:
+    """Score and measure a recorded episode.
+
+    Args:
+        record: the episode; ``record.ground_truth`` may be missing, and every step's messages but its view.
+        object_name: the object, where the bag does not say it or says it wrong.
+
+    Raises:
+        ValueError: the object is not known.
+    """
+    name = object_name or record.object
+    if name is None:
+        raise ValueError(f"{record.folder}: the bag does not say which object it shows; name it with --object")
+    # The bag's word must not choose a file, so only listed names are loaded.
+    if name not in list_objects():
+        known = ", ".join(list_objects())
+        raise ValueError(f"{record.folder}: object '{name}' is not among {known}; name one with --object")
+    model = load_object(name)
+    truth = record.ground_truth
+    positions = record.positions
+    sphere = ViewSphere(radius=float(np.linalg.norm(positions, axis=1).mean()))
+    moved = np.concatenate([[0.0], sphere.arc(positions[:-1], positions[1:])])
+    azimuth, elevation = np.degrees(sphere.angles(positions)).T
+    steps = []
+    for number, step in enumerate(record.steps):
+        objects = step.objects if step.objects is not None else SceneObjects.empty()
+        score = evaluate_scene(model, objects.T_world_object, truth) if truth is not None and len(truth) else None
+        steps.append(
+            StepAnalysis(
+                number=number,
+                record=step,
+                objects=objects,
+                rows=_rows(step, objects, score),
+                truth=score,
+                azimuth=float(azimuth[number] % 360.0),
+                elevation=float(elevation[number]),
+                moved_m=float(moved[number]),
+                total_m=float(moved[: number + 1].sum()),
+            )
+        )
+    return EpisodeAnalysis(model, record, sphere, steps, _node_times(record))
+
+
+def _rows(step: RecordedStep, objects: SceneObjects, truth: SceneScore | None) -> list[ObjectRow]:
+    attention = step.attention if step.attention is not None and len(step.attention) == len(objects) else None
+    matched = {} if truth is None else {int(k): n for n, k in enumerate(truth.matched) if k >= 0}
+    return [
+        ObjectRow(
+            index=i,
+            verification=float(objects.verification[i]),
+            score=float(objects.score[i]),
+            support=int(objects.support[i]),
+            spread_mm=1e3 * float(objects.spread[i]),
+            attention=None if attention is None else float(attention[i]),
+            attended=step.attended == i,
+            e_add_mm=float(truth.e_add_mm[matched[i]]) if i in matched else None,
+            detected=i in matched and bool(truth.detected[matched[i]]),
+        )
+        for i in range(len(objects))
+    ]
+
+
+def _node_times(record: EpisodeRecord) -> list[NodeTime]:
+    nodes = sorted({node for step in record.steps for node in step.latency_ms})
+    times = []
+    for node in nodes:
+        latencies = np.array([step.latency_ms[node] for step in record.steps if node in step.latency_ms])
+        times.append(NodeTime(node, len(latencies), float(np.median(latencies)), float(latencies.max())))
+    return sorted(times, key=lambda time: -time.median_ms)

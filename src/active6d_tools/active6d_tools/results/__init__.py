@@ -1,0 +1,1 @@
+"""docs/results.md: which commands measure it, its tables and its bars."""

@@ -1,0 +1,180 @@
+"""Which commands make docs/results.md, and how what they wrote gets into it: no number there is typed by hand."""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from active6d_tools.report import results_tables as tables
+from active6d_tools.results.goals import CLAIMS, DEFAULT, GOALS, PAPERS, Measured, goals_table
+
+OBJECTS = ("coffee_cup", "bunny", "mug")
+_REPORTS, _FIGURES = "docs/results", "docs/img"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One command, run for each object.
+
+    Attributes:
+        name: of what it measures; part of its files' names.
+        command: of ``active6d``, without object and files.
+        draws: whether it draws a figure.
+        trains: whether it trains, which takes longer than anything else.
+        times: whether it measures time, and so wants the machine for itself.
+    """
+
+    name: str
+    command: str
+    draws: bool = False
+    trains: bool = False
+    times: bool = False
+
+    def report(self, object_name: str) -> str:
+        """The JSON file."""
+        return f"{_REPORTS}/{self.name}_{object_name}.json"
+
+    def figure(self, object_name: str) -> str:
+        """The PNG file, where it draws one."""
+        return f"{_FIGURES}/results_{self.name}_{object_name}.png"
+
+    def arguments(self, object_name: str) -> list[str]:
+        """Of ``active6d``, in the repository."""
+        drawn = ["--png", self.figure(object_name)] if self.draws else []
+        return [*self.command.split(), "--object", object_name, "--json", self.report(object_name), *drawn]
+
+    def is_done(self, root: Path, object_name: str) -> bool:
+        """Whether its files are there."""
+        files = [self.report(object_name), *([self.figure(object_name)] if self.draws else [])]
+        return all((root / file).is_file() for file in files)
+
+
+JOBS = {
+    job.name: job
+    for job in (
+        Job("evaluate", "evaluate --policies all --steps 5"),
+        Job("evaluate_ten", "evaluate --policies random --steps 10"),
+        Job(
+            "steps",
+            f"ablate steps --policies random,max-distance,unidirectional,lowest-score,{DEFAULT} --sample 100",
+            draws=True,
+        ),
+        Job("planning", "ablate planning --sample 200", draws=True),
+        Job(
+            "noise-resampling",
+            f"ablate noise-resampling --policies unidirectional,{DEFAULT} --sample 1000",
+            draws=True,
+        ),
+        Job("fusion", "ablate fusion --policies random --sample 1000"),
+        Job("verification", "ablate verification --policies random --sample 1000"),
+        Job("alpha", "ablate alpha --sample 1000", draws=True, trains=True),
+        Job("attention", "ablate attention --sample 1000", trains=True),
+        Job("signs", "ablate signs --sample 1000", trains=True),
+        Job("seeds", "ablate seeds --sample 1000", trains=True),
+        Job("environment", "benchmark environment", times=True),
+        Job("pipeline", "benchmark pipeline", draws=True, times=True),
+    )
+}
+
+
+def read_reports(root: Path) -> dict[str, Measured]:
+    """What was measured, by object and job, for those whose files are there.
+
+    Raises:
+        ValueError: a file is damaged; the message names it.
+    """
+    measured: dict[str, dict[str, dict[str, Any]]] = {}
+    for name in OBJECTS:
+        measured[name] = {}
+        for job in JOBS.values():
+            path = root / job.report(name)
+            if path.is_file():
+                try:
+                    measured[name][job.name] = json.loads(path.read_text())
+                except ValueError as error:
+                    raise ValueError(f"{path}: no report ({error}); delete it and make it again") from error
+    return measured
+
+
+def fill(page: str, measured: Mapping[str, Measured]) -> str:
+    """Renew every block of a page between ``<!-- results: NAME -->`` and ``<!-- end -->``.
+
+    Raises:
+        ValueError: a block that nobody knows how to make.
+    """
+
+    def renew(match: re.Match) -> str:
+        if match[2] not in BLOCKS:
+            raise ValueError(f"docs/results.md has a block '{match[2]}'; known are {', '.join(BLOCKS)}")
+        return f"{match[1]}\n{BLOCKS[match[2]](measured)}\n{match[3]}"
+
+    return re.sub(r"(<!-- results: ([\w ]+) -->)\n.*?(<!-- end -->)", renew, page, flags=re.DOTALL)
+
+
+def _of_job(name: str, measured: Mapping[str, Measured]) -> dict[str, dict[str, Any]]:
+    return {object_name: own[name] for object_name, own in measured.items() if name in own}
+
+
+def _command(name: str) -> str:
+    return f"    active6d {' '.join(JOBS[name].arguments('NAME'))}"
+
+
+def _block(name: str, make: Callable[[tables.Reports], str]) -> Callable[[Mapping[str, Measured]], str]:
+    """The command, then a table of what it wrote."""
+
+    def render(measured: Mapping[str, Measured]) -> str:
+        reports = _of_job(name, measured)
+        parts = [_command(name), make(reports) if reports else "Not measured yet."]
+        if JOBS[name].draws:
+            parts += [f"![{name}, {each}](img/{Path(JOBS[name].figure(each)).name})" for each in reports]
+        return "\n\n".join(parts)
+
+    return render
+
+
+def _each(make: Callable[[dict[str, Any]], str]) -> Callable[[tables.Reports], str]:
+    """One table an object, under its name."""
+
+    def render(reports: tables.Reports) -> str:
+        return "\n\n".join(
+            f"**{name}**, {report['episodes']} episodes in {report['scenes']} scenes\n\n{make(report)}"
+            for name, report in reports.items()
+        )
+
+    return render
+
+
+def _against(name: str) -> Callable[[dict[str, Any]], str]:
+    def render(report: dict[str, Any]) -> str:
+        return tables.differences_table(report, name) if name in report["policies"] else "Not measured yet."
+
+    return render
+
+
+def _variants(*keys: str) -> Callable[[tables.Reports], str]:
+    return lambda reports: tables.variants_table(reports, keys)
+
+
+_PAPERS_MEASURES = ("detection_rate", "e_add_mm", "distance_m")
+_FUSED = ("detection_rate", "e_add_mm", "detection_rate_at_n", "reported")
+BLOCKS: dict[str, Callable[[Mapping[str, Measured]], str]] = {
+    "goals": lambda measured: goals_table(GOALS, measured),
+    "claims": lambda measured: goals_table(CLAIMS, measured, "reproduced"),
+    "evaluate": _block("evaluate", _each(tables.policies_table)),
+    "default differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate", measured)),
+    "paper differences": lambda measured: _each(_against(PAPERS))(_of_job("evaluate", measured)),
+    "evaluate ten": _block("evaluate_ten", _each(tables.policies_table)),
+    "steps": _block("steps", tables.steps_tables),
+    "planning": _block("planning", _variants("detection_rate", "e_add_mm", "distance_m", "moves")),
+    "noise-resampling": _block("noise-resampling", tables.noise_resampling_table),
+    "fusion": _block("fusion", _variants(*_FUSED)),
+    "verification": _block("verification", _variants(*_FUSED)),
+    "alpha": _block("alpha", _variants(*_PAPERS_MEASURES)),
+    "attention": _block("attention", _variants(*_PAPERS_MEASURES)),
+    "signs": _block("signs", _variants(*_PAPERS_MEASURES)),
+    "seeds": _block("seeds", tables.seeds_table),
+    "environment": _block("environment", tables.environment_table),
+    "pipeline": _block("pipeline", tables.pipeline_table),
+}

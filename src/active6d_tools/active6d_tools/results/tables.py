@@ -1,0 +1,179 @@
+"""What ``active6d evaluate`` and ``active6d ablate`` wrote, as Markdown tables for docs/results.md.
+
+A cell says whether its difference from what it is compared with excludes zero, so that a loss is as visible as a win.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+#: An object's name to what a command wrote about it.
+Reports = Mapping[str, dict[str, Any]]
+
+#: Key, unit, digits, and the sign of a change for the better (0 for neither).
+MEASURES = {
+    "detection_rate": ("", 3, 1),
+    "detection_rate_at_n": (" of the best n", 3, 1),
+    "e_add_mm": (" mm", 2, -1),
+    "distance_m": (" m", 2, -1),
+    "moves": (" moves", 1, 0),
+    "reported": (" an object", 2, 0),
+}
+PAPER_STEPS = 5
+#: Table 1 of the paper, after five moves: metres, e_ADD in mm, detection rate.
+PAPER = {
+    "coffee_cup": {
+        "random": (4.97, 13.48, 0.76),
+        "max-distance": (7.66, 14.02, 0.75),
+        "unidirectional": (2.88, 14.32, 0.74),
+        "attention": (3.71, 11.12, 0.80),
+    },
+    "bunny": {
+        "random": (3.97, 26.69, 0.19),
+        "max-distance": (7.68, 26.83, 0.46),
+        "unidirectional": (2.88, 27.12, 0.44),
+        "attention": (2.43, 25.35, 0.46),
+    },
+}
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def number(value: float, digits: int, sign: bool = False) -> str:
+    """A number as docs print it: no zero before the point."""
+    text = f"{value:{'+' if sign else ''}.{digits}f}"
+    return text.replace("0.", ".", 1) if abs(value) < 1 and digits == 3 else text
+
+
+def percent(share: float, sign: bool = False) -> str:
+    """A share in hundredths."""
+    return f"{100 * share:{'+' if sign else ''}.0f} %"
+
+
+def interval(ends: Sequence[float], digits: int, sign: bool = False) -> str:
+    """Two ends in brackets."""
+    return f"({' to '.join(number(end, digits, sign) for end in ends)})"
+
+
+def mark(difference: dict[str, Any], better: int) -> str:
+    """``✓`` better and ``✗`` worse where the interval over scenes excludes zero, in brackets where only that over
+    episodes does, ``=`` where neither does."""
+    if better == 0:
+        return ""
+    if not (difference["excludes_zero"] or difference["excludes_zero_scenes"]):
+        return "="
+    sign = "✓" if difference["mean"] * better > 0 else "✗"
+    return sign if difference["excludes_zero_scenes"] else f"({sign})"
+
+
+def policies_table(report: dict[str, Any]) -> str:
+    """The paper's Table 1, with intervals over scenes, bounds, and the paper's numbers where it has any."""
+    paper = PAPER.get(report["object"], {}) if report["steps"] == PAPER_STEPS else {}
+    header = ["policy", "d, m", "e_ADD, mm", "detection rate", "gap closed"]
+    rows = []
+    for name, row in report["policies"].items():
+        cells = [f"`{name}`", number(row["distance_m"], 2)]
+        for key in ("e_add_mm", "detection_rate"):
+            digits = MEASURES[key][1]
+            cells.append(f"{number(row[key], digits)} {interval(row[f'{key}_ci95_scenes'], digits)}")
+        cells.append("" if row["gap_closed"] is None else percent(row["gap_closed"]))
+        if paper:
+            metres, error, rate = paper.get(name, (None, None, None))
+            cells.append("" if rate is None else f"{metres:.2f} m, {error:.2f} mm, {rate:.2f}")
+        rows.append(cells)
+    return table([*header, "in the paper"] if paper else header, rows)
+
+
+def differences_table(report: dict[str, Any], name: str) -> str:
+    """A policy against every other, start by start: its value less theirs."""
+    keys = ("detection_rate", "e_add_mm", "distance_m")
+    rows = []
+    for other, difference in report["policies"][name]["against"].items():
+        cells = [f"`{other}`"]
+        for key in keys:
+            _, digits, better = MEASURES[key]
+            own = difference[key]
+            told = f"{number(own['mean'], digits, True)} {interval(own['ci95_scenes'], digits, True)}"
+            cells.append(f"{mark(own, better)} {told}")
+        rows.append(cells)
+    return table([f"`{name}` less", "detection rate", "e_ADD, mm", "d, m"], rows)
+
+
+def variants_table(reports: Reports, keys: Sequence[str]) -> str:
+    """Variants down, objects across; a mark where a variant is compared with the first."""
+    return _pivot(reports, lambda row: row["variant"], lambda row: describe_row(row, keys))
+
+
+def describe_row(row: dict[str, Any], keys: Sequence[str]) -> str:
+    """The measures of one row of an ablation."""
+    parts = []
+    for key in keys:
+        unit, digits, better = MEASURES[key]
+        against = row.get("against_first")
+        sign = mark(against[key], better) if against else ""
+        parts.append(f"{sign} {number(row[key], digits)}{unit}".strip())
+    return ", ".join(parts)
+
+
+def seeds_table(reports: Reports) -> str:
+    """Every training: found, e_ADD; found on validation scenes; minutes; which one ships."""
+
+    def tell(row: dict[str, Any]) -> str:
+        found = describe_row(row, ("detection_rate", "e_add_mm"))
+        chosen = "**best**" * row["best_on_validation"]
+        ships = "ships" * row["shipped"]
+        on_validation = f"validation {number(row['validation_detection_rate'], 3)} {chosen}".strip()
+        return ", ".join(filter(None, (found, on_validation, f"{row['training_minutes']:.0f} min", ships)))
+
+    return _pivot(reports, lambda row: row["variant"], tell)
+
+
+def steps_tables(reports: Reports) -> str:
+    """Of every object: budgets T down, found and e_ADD of policies across."""
+    parts = []
+    for name, report in reports.items():
+        rows = {(row["budget"], row["variant"]): row for row in report["rows"]}
+        budgets, policies = (list(dict.fromkeys(names)) for names in zip(*rows, strict=True))
+        told = ("detection_rate", "e_add_mm")
+        lines = ([str(T), *(describe_row(rows[T, policy], told) for policy in policies)] for T in budgets)
+        parts += [f"**{name}**", table(["T", *(f"`{policy}`" for policy in policies)], lines)]
+    return "\n\n".join(parts)
+
+
+def noise_resampling_table(reports: Reports) -> str:
+    """Whose views and with which noise down: found, e_ADD, and the share of the gap with its interval over scenes."""
+
+    def tell(row: dict[str, Any]) -> str:
+        share, (low, high) = row["gap_closed"], row["gap_closed_ci95_scenes"]
+        ends = f" ({100 * low:.0f} to {100 * high:.0f})" if high - low > 0.005 else ""
+        return f"{describe_row(row, ('detection_rate', 'e_add_mm'))}, {percent(share)}{ends}"
+
+    return _pivot(reports, lambda row: f"`{row['policy']}`, {row['noise']} noise", tell)
+
+
+def _pivot(reports: Reports, key: Callable[[dict], str], tell: Callable[[dict], str]) -> str:
+    columns = [{key(row): tell(row) for row in report["rows"]} for report in reports.values()]
+    names = list(dict.fromkeys(name for column in columns for name in column))
+    return table(["", *reports], ([name, *(column.get(name, "") for column in columns)] for name in names))
+
+
+def environment_table(reports: Reports) -> str:
+    """Training steps a second."""
+    header = ["", "steps a second", "processes"]
+    return table(
+        header, ([name, f"{own['steps_per_second']:,.0f}", str(own["workers"])] for name, own in reports.items())
+    )
+
+
+def pipeline_table(reports: Reports) -> str:
+    """What the last of six views costs behind the estimator."""
+    header = ["", "objects", "verification", "fusion", "policy", "all", "a decision, 99th percentile"]
+    rows = []
+    for name, own in reports.items():
+        parts = (f"{own[f'{part}_ms']:.2f} ms" for part in ("verification", "fusion", "policy"))
+        rate, slowest = f"{own['hz_total']:,.0f} Hz", f"{own['policy_ms_p99']:.2f} ms"
+        rows.append([name, str(own["objects"]), *parts, rate, slowest])
+    return table(header, rows)

@@ -1,0 +1,1 @@
+"""Studies behind design decisions; each module is a command with `--help`."""

@@ -1,0 +1,71 @@
+#!/usr/bin/env python3
+"""Expected visibility against the rendered shares stored with the validation scenes: with the true poses given, and of
+the missed objects after a few random views, with nothing given but what the policy knows.
+
+Usage: python -m active6d_tools.studies.compare_visibility OBJECT
+"""
+
+import argparse
+
+import numpy as np
+
+from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.scene_bank import find_bank, load_bank
+from active6d_agent.evaluation.oracle import known
+from active6d_agent.evaluation.policy_evaluation import observe
+from active6d_agent.policies.view_attention.dagger import stand_for
+from active6d_agent.policies.view_attention.features import represent
+from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.scene.expected_visibility import Tray, expected_visibility
+from active6d_sim.scenes.scene_store import SPLITS, load_scene
+
+VIEWS = (2, 3, 4)
+CHOICES = 15
+
+
+def compare_true_poses(model: ObjectModel) -> None:
+    """All objects of the stored scenes, those that no view shows among them."""
+    eyes, visibility = ViewSphere().positions, expected_visibility(model)
+    scenes = [load_scene(model.name, "val", index) for index in range(SPLITS["val"])]
+    rendered = np.concatenate([scene.visible_fraction.T.ravel() for scene in scenes])
+    for what, tray in (("with walls", Tray.for_model(model)), ("without walls", None)):
+        told = []
+        for scene in scenes:
+            everything = np.concatenate([scene.T_world_object, scene.T_world_hidden])
+            told.append(visibility.shares(everything, eyes, tray)[: len(scene.T_world_object)].ravel())
+        told = np.concatenate(told)
+        off, correlation = np.abs(told - rendered).mean(), np.corrcoef(told, rendered)[0, 1]
+        print(f"{model.name} {what:14} mean difference {off:.3f}, correlation {correlation:.3f}")
+
+
+def compare_missed(model: ObjectModel) -> None:
+    """Over the grid's views, of each missed object, what the item shows that stands for it: the mean correlation."""
+    lookup, rng = BatchedFusion(load_bank(find_bank(model.name, "val"))), np.random.default_rng(0)
+    correlations: dict[str, list[float]] = {"a hypothesis": [], "a patch": []}
+    for index in range(SPLITS["val"]):
+        rendered = load_scene(model.name, "val", index).visible_fraction
+        for count in np.repeat(VIEWS, CHOICES):
+            views = rng.choice(len(lookup.sphere), (1, count), replace=False)
+            scene = np.array([index])
+            state = represent(observe(lookup, scene, views, np.array([1]))[0], model)
+            rows = lookup.fuse(scene, views, views[:, -1]).objects[0]
+            missed = known(lookup, scene, views)[0, :, 0] == 0
+            for item, true in zip(*stand_for(lookup, index, rows, state.patches), strict=True):
+                if missed[true] and np.ptp(state.shown[item]) > 0:
+                    correlation = np.corrcoef(state.shown[item], rendered[:, true])[0, 1]
+                    correlations["a patch" if state.scalars[item, 4] else "a hypothesis"].append(correlation)
+    for what, values in correlations.items():
+        print(f"{model.name} missed, {what} stands for it: {len(values)}, correlation {np.mean(values):.3f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
+    parser.add_argument("object")
+    model = load_object(parser.parse_args().object)
+    compare_true_poses(model)
+    compare_missed(model)
+
+
+if __name__ == "__main__":
+    main()

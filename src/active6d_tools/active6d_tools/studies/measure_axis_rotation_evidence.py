@@ -1,0 +1,71 @@
+#!/usr/bin/env python3
+"""Count what depth images show where a handle would be, at right turns and at wrong ones: the ratios of dense/turns.py.
+
+Usage: scripts/measure_axis_rotation_evidence.py OBJECT WEIGHTS SHARD.npz ... [--every N]
+
+The shards are training views that the weights were not learned from. Also prints the likelihood of the true turns for
+several shares that a pixel may count.
+"""
+
+import numpy as np
+from rich.progress import track
+from scipy.special import softmax
+
+from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
+from active6d_perception.estimators.dense.canonical_frame import TURNS, rotation_about_z
+from active6d_perception.estimators.dense.decoding import axis_rotation_probability, decode
+from active6d_perception.estimators.dense.estimator import DenseEstimator
+from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
+from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera, pool_depth
+from active6d_perception.estimators.dense.training.samples import Sample
+from active6d_perception.estimators.refinement import refine
+from active6d_perception.model.model_views import model_views
+from active6d_tools.studies.shard_arguments import read_arguments
+
+SHAPE = 7, 4
+RIGHT, WRONG, TOLERATED = np.radians([2.6, 30.0, 22.0])
+
+
+def count(
+    sample: Sample, estimator: DenseEstimator, search: AxisRotationSearch, canonical_frame
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, turns, 28) pixels by case, and (n,) true turn, of the instances whose centre and axis are right."""
+    model, view = estimator.model, sample.view
+    depth = pool_depth(view.depth, OUTPUT_STRIDE)
+    instances = decode(estimator.ask(view), depth, output_camera(view.camera), canonical_frame, model.diameter)
+    surface = MeasuredSurface.of(view, instances)
+    if surface.tree is None or not len(sample.T_camera_object):
+        return np.zeros((0, len(TURNS), SHAPE[0] * SHAPE[1])), np.zeros(0)
+    T = instances.T_camera_axis
+    T = T @ rotation_about_z(TURNS[axis_rotation_probability(T, instances.direction).argmax(axis=1)])
+    T = refine(model_views(model), canonical_frame.object_pose(T), surface.tree, surface.tree_normals, gates=(0.008,))
+    T = T @ canonical_frame.T_object_axis
+    true = canonical_frame.axis_pose(sample.T_camera_object)
+    distance = np.linalg.norm(T[:, None, :3, 3] - true[:, :3, 3], axis=-1)
+    true = true[distance.argmin(axis=1)]
+    R = np.swapaxes(T[:, :3, :3], 1, 2) @ true[:, :3, :3]
+    right = (distance.min(axis=1) < 0.008) & (R[:, 2, 2] > np.cos(np.radians(8)))
+    instance, turn, case, pixels = search.cases(T, surface)
+    shape = len(T), len(TURNS), SHAPE[0] * SHAPE[1]
+    table = np.bincount(np.ravel_multi_index((instance, turn, case), shape), pixels, np.prod(shape)).reshape(shape)
+    return table[right], np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1])[right]
+
+
+def main() -> None:
+    model, trained, samples = read_arguments(__doc__.splitlines()[0], every=6)
+    estimator, search = DenseEstimator(model, trained), AxisRotationSearch(model, trained.canonical_frame)
+    tables, turns = zip(
+        *(count(sample, estimator, search, trained.canonical_frame) for sample in track(samples)), strict=True
+    )
+    tables, turns = np.concatenate(tables), np.concatenate(turns)
+    off = np.abs((TURNS - turns[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    right, wrong = (tables[mask].sum(axis=0) for mask in (off < RIGHT, off > WRONG))
+    ratio = np.log((right / right.sum() + 3e-4) / (wrong / wrong.sum() + 3e-4))
+    print(f"{len(turns)} instances; rows and columns as in dense/turns.py\n{ratio.reshape(SHAPE).round(1)}")
+    for share in (0.01, 0.02, 0.03, 0.05, 0.1):
+        probability = (softmax(share * tables @ ratio, axis=1) * (off < TOLERATED)).sum(axis=1)
+        print(f"a pixel counts {share}: mean log-likelihood of the true turn {np.log(probability + 1e-3).mean():.3f}")
+
+
+if __name__ == "__main__":
+    main()

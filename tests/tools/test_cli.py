@@ -1,0 +1,218 @@
+"""The command's manners: help with examples, one clear line and exit code 2 on bad input, a quick start."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import typer
+from PIL import Image
+from typer.testing import CliRunner
+
+from active6d_core.se3 import make_transform
+from active6d_sim.scenes.scene import Bin, Scene
+from active6d_tools.cli import app
+from active6d_tools.cli.episode import parse_overrides
+from active6d_tools.cli.output import write_file, write_json
+
+
+def run(*arguments: str):
+    return CliRunner().invoke(app, list(arguments), env={"COLUMNS": "200", "TERM": "dumb"})
+
+
+def commands(group: typer.core.TyperGroup, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    found = []
+    for name, command in group.commands.items():
+        found += commands(command, (*path, name)) if hasattr(command, "commands") else [(*path, name)]
+    return found
+
+
+COMMANDS = commands(typer.main.get_command(app))
+
+
+@pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
+def test_every_command_has_help_with_an_example(path):
+    result = run(*path, "--help")
+    assert result.exit_code == 0
+    assert f"Example: active6d {' '.join(path)}" in result.stdout
+
+
+def test_without_a_command_the_help_is_shown():
+    result = run()
+    assert result.exit_code == 0
+    assert "episode" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nonsense"], "No such command 'nonsense'"),
+        (["object"], "Missing command"),
+        (["train"], "Missing command"),
+        (["episode", "--steps", "-1"], "--steps"),
+        (["episode", "--steps", "many"], "--steps"),
+        (["episode", "--sede", "3"], "--sede"),
+        (["episode", "--object", "teapot"], "unknown object 'teapot'; known: bunny"),
+        (["episode", "--policy", "clever"], "--policy 'clever' is not among"),
+        (["episode", "--estimator", "magic"], "--estimator 'magic' is not among"),
+        (["episode", "--report", "x.html"], "--report needs --bag"),
+        (["episode", "--figure", "x.png"], "--figure needs --bag"),
+        (["episode", "--set", "fusion"], "--set fusion: expected NODE.NAME=VALUE"),
+        (["episode", "--set", "hypothesis_fusion.epsilon=[1"], "not YAML"),
+        (["episode", "--params-file", "/nowhere.yaml"], "/nowhere.yaml does not exist"),
+        (["replay", "/nowhere"], "/nowhere: no such folder"),
+        (["replay", "/nowhere", "--rate", "2", "--as-fast"], "exclude each other"),
+        (["replay", "/nowhere", "--rate", "0"], "--rate"),
+        (["report", "/nowhere"], "/nowhere: no such folder"),
+        (["report"], "Missing argument 'DIR'"),
+        (["object", "show", "teapot"], "unknown object 'teapot'"),
+        (["object", "add", "/nowhere.ply", "--name", "x"], "mesh /nowhere.ply does not exist"),
+        (["object", "add", "/nowhere.ply", "--name", "../x"], "--name '../x'"),
+        (["object", "list", "--json", "/proc/nowhere/x.json"], "/proc/nowhere"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments, words):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    lines = result.stderr.strip().splitlines()
+    assert lines[-1].startswith("active6d: ")
+    assert words in lines[-1]
+    assert "Traceback" not in result.stderr
+
+
+def test_the_command_starts_without_heavy_libraries():
+    heavy = "numpy scipy rclpy open3d torch pybullet matplotlib jinja2 trimesh rosbags"
+    code = f"import sys, active6d_tools.cli; print([name for name in '{heavy}'.split() if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_it_runs_as_a_module():
+    done = subprocess.run(
+        [sys.executable, "-m", "active6d_tools", "object", "show", "teapot"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("active6d: unknown object 'teapot'")
+
+
+def test_object_list_and_show_as_json(tmp_path):
+    assert run("object", "list", "--json", str(tmp_path / "list.json")).exit_code == 0
+    listed = {item["name"]: item for item in json.loads((tmp_path / "list.json").read_text())["objects"]}
+    assert {"bunny", "coffee_cup", "mug"} <= listed.keys()
+    # 120 mm high, 90 mm across the lid, 60 mm across the base: the longest way is from lid to base across the cup.
+    assert listed["coffee_cup"]["diameter_mm"] == pytest.approx(np.hypot(120.0, 75.0), abs=1.0)
+    shown = run("object", "show", "mug", "--png", str(tmp_path / "mug.png"))
+    assert shown.exit_code == 0
+    assert "handle" in shown.stdout
+    picture = np.asarray(Image.open(tmp_path / "mug.png"), float)
+    assert picture.shape == (420, 1680, 3)
+    red = (picture[..., 0] > 1.5 * picture[..., 1]) & (picture[..., 0] > 1.5 * picture[..., 2])
+    assert all(0.1 < part.mean() < 0.6 for part in np.split(red, 4, axis=1))
+
+
+def test_an_added_object_is_found_and_measured(tmp_path, monkeypatch):
+    mesh = tmp_path / "brick.stl"
+    trimesh.creation.box((30.0, 40.0, 120.0)).export(mesh)
+    added = run("object", "add", str(mesh), "--name", "brick", "--scale", "0.001", "--into", str(tmp_path / "objects"))
+    assert added.exit_code == 0
+    assert "130.0 mm" in added.stdout
+    assert f"ACTIVE6D_OBJECT_PATH={tmp_path / 'objects'}" in added.stdout.replace("\n", "")
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path / "objects"))
+    assert "130.0 mm" in run("object", "list").stdout
+    again = run("object", "add", str(mesh), "--name", "brick", "--into", str(tmp_path / "objects"))
+    assert again.exit_code == 2
+    assert "exists already" in again.stderr
+
+
+def test_a_mesh_that_is_none_leaves_nothing_behind(tmp_path):
+    mesh = tmp_path / "empty.ply"
+    mesh.write_text("ply\n")
+    result = run("object", "add", str(mesh), "--name", "empty", "--into", str(tmp_path / "objects"))
+    assert result.exit_code == 2
+    assert [path for path in (tmp_path / "objects").rglob("*") if path.is_file()] == []
+
+
+def test_overrides_are_read_as_yaml():
+    texts = ["camera_simulator.noise=0.5", "camera_simulator.snap=false", "pose_estimator.name=a=b"]
+    assert parse_overrides(texts) == {
+        "camera_simulator": {"noise": 0.5, "snap": False},
+        "pose_estimator": {"name": "a=b"},
+    }
+
+
+def test_files_are_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "deep" / "result.json"
+    write_json(path, {"rate": 0.5})
+    document = json.loads(path.read_text())
+    assert document["rate"] == 0.5
+    assert "numpy" in document["versions"]
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(path, {"rate": float("nan")})
+    assert json.loads(path.read_text()) == document
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        write_file(tmp_path / "folder", "text")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["deep", "folder"]
+    assert Path(path).stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["scenes", "show", "mug/test"], "not of the form mug/test/3"),
+        (["scenes", "show", "mug/test/99"], "no scene 'mug/test/99'"),
+        (["scenes", "show", "teapot/seed/1"], "unknown object 'teapot'"),
+        (["scenes", "show", "mug/seed/7", "--view", "100"], "the grid has views 0 to 99"),
+        (["scenes", "report", "--split", "exam"], "no scene 'mug/exam/0'"),
+        (["scenes", "generate", "--split", "exam"], "unknown split 'exam'"),
+        (["benchmark", "graph", "--object", "teapot"], "unknown object 'teapot'"),
+        (["benchmark", "estimator", "--split", "exam"], "unknown split 'exam'"),
+        (["benchmark", "estimator", "--estimator", "magic"], "unknown estimator 'magic'"),
+    ],
+)
+def test_bad_scene_or_benchmark_is_one_line_and_exit_code_2(arguments, words):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert words in result.stderr.strip().splitlines()[-1]
+
+
+def make_stored_scenes(folder: Path, visible_fraction: np.ndarray) -> None:
+    """Ten test scenes of one mug lying alone, with made-up visible fractions for its several objects."""
+    n = visible_fraction.shape[1]
+    poses = make_transform(np.eye(3), np.c_[0.2 * np.arange(n), np.zeros(n), np.full(n, 0.05)])
+    (folder / "mug").mkdir(parents=True)
+    for index in range(10):
+        scene = Scene("mug", f"mug/test/{index}", index, poses, Bin(0.4, 0.4, 0.05), visible_fraction)
+        scene.save(folder / "mug" / f"test_{index:02d}.npz")
+
+
+def test_scenes_report_counts_objects_that_are_half_visible(tmp_path, monkeypatch):
+    # Seen from everywhere; from half the views of every elevation; from one view only; from nowhere.
+    fraction = np.zeros((100, 4))
+    fraction[:, 0] = 0.9
+    fraction[np.arange(100) % 20 < 10, 1] = 0.5
+    fraction[17, 2] = 0.6
+    fraction[:, 3] = 0.49
+    make_stored_scenes(tmp_path, fraction)
+    monkeypatch.setenv("ACTIVE6D_SCENE_PATH", str(tmp_path))
+    result = run("scenes", "report", "--json", str(tmp_path / "report.json"))
+    assert result.exit_code == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["counts"] == [4] * 10
+    assert report["all_views"] == 0.75
+    assert report["oracle"] == 0.75
+    assert report["revolution"] == 0.5
+    assert report["one_view"] == pytest.approx((1 + 0.5 + 0.01) / 4, abs=0.05)
+
+
+def test_scenes_show_draws_the_views(tmp_path):
+    result = run("scenes", "show", "bunny/seed/3", "--view", "45", "--view", "90", "--png", str(tmp_path / "scene.png"))
+    assert result.exit_code == 0
+    assert "azimuth  90°   elevation 45°" in result.stdout
+    assert Image.open(tmp_path / "scene.png").size == (1280, 960)

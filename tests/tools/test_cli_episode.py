@@ -1,0 +1,100 @@
+"""episode, report and replay as a user types them one after the other, with stubs for camera and estimator."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from active6d_bringup.bags.reader import read_episode
+from active6d_bringup.graph import episode as episode_module
+from active6d_bringup.graph.composition import NODES
+from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted
+from active6d_core.metrics import evaluate_scene
+from active6d_core.object_model import load_object
+from active6d_tools.cli import app
+
+
+@pytest.fixture(autouse=True)
+def stub_camera(monkeypatch):
+    monkeypatch.setitem(NODES, "camera_simulator", ("stub_camera", "StubCameraNode"))
+    import stub_camera  # noqa: F401  registers the estimator
+
+
+@dataclass(frozen=True)
+class Result:
+    exit_code: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def run(capfd, monkeypatch):
+    """Runs the command on real file descriptors, which rclpy's executor needs."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run_command(*arguments) -> Result:
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as exit_info:
+            app([str(argument) for argument in arguments], prog_name="active6d")
+        return Result(exit_info.value.code, *capfd.readouterr())
+
+    return run_command
+
+
+def test_episode_report_and_replay(tmp_path, run):
+    bag, page, picture = tmp_path / "bag", tmp_path / "page.html", tmp_path / "picture.png"
+    told, figure = tmp_path / "episode.json", tmp_path / "figure.png"
+    stub = ("--object", "mug", "--seed", 4, "--policy", "random", "--steps", 2, "--estimator", "stub")
+    result = run("episode", *stub, "--bag", bag, "--report", page, "--figure", figure, "--json", told)
+    assert result.exit_code == 0, result.stderr
+    record = read_episode(bag)
+    summary = json.loads(told.read_text())
+    assert summary["moves"] == 2
+    score = evaluate_scene(load_object("mug"), record.steps[-1].objects.T_world_object, record.ground_truth)
+    assert summary["detection_rate"] == pytest.approx(score.detection_rate)
+    assert summary["e_add_mm"] == pytest.approx(score.mean_e_add_mm)
+    chords = np.linalg.norm(np.diff(record.positions, axis=0), axis=1)
+    assert summary["distance_m"] == pytest.approx((2 * 0.8 * np.arcsin(chords / 1.6)).sum(), abs=1e-9)
+    assert f"found    {score.detected.sum()} of {len(score.detected)}" in result.stdout
+    assert "budget of 2 moves spent" in result.stdout
+    assert [line for line in result.stderr.splitlines() if line.startswith("view  2 at")]
+    assert page.read_text().startswith("<!doctype html>")
+
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+    again = run("report", bag, "--png", picture, "--figure", tmp_path / "again.png", "--json", tmp_path / "report.json")
+    assert again.exit_code == 0, again.stderr
+    assert (bag / "report.html").read_text() == page.read_text()
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "again.png").read_bytes() == figure.read_bytes()
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["distance_m"] == pytest.approx(summary["distance_m"])
+    assert f"found {score.detected.sum()} of {len(score.detected)} objects" in again.stdout
+    assert run("report", bag, "--episode", 1).exit_code == 2
+
+    replayed = run("replay", bag, "--as-fast", "--compare", "--json", tmp_path / "replay.json")
+    assert replayed.exit_code == 0, replayed.stderr
+    assert json.loads((tmp_path / "replay.json").read_text())["equal"] is True
+
+    refused = run("episode", *stub, "--bag", bag)
+    assert refused.exit_code == 2
+    assert "exists already" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (EpisodeError("no answer from pose_estimator"), 1, "no answer from pose_estimator"),
+        (EpisodeInterrupted(), 130, ""),
+    ],
+)
+def test_an_episode_that_fails_is_one_line(monkeypatch, run, error, code, words):
+    def fail(*arguments):
+        raise error
+
+    monkeypatch.setattr(episode_module, "run_episode", fail)
+    result = run("episode", "--estimator", "stub")
+    assert result.exit_code == code
+    assert words in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr

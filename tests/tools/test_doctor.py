@@ -1,0 +1,48 @@
+"""The doctor finds what is missing, and says so in a form that scripts can read."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from active6d_tools import doctor
+from active6d_tools.cli import app
+from active6d_tools.doctor import Check, works
+
+
+def test_this_machine_is_well(tmp_path):
+    path = tmp_path / "doctor.json"
+    result = CliRunner().invoke(app, ["doctor", "--json", str(path)], env={"COLUMNS": "200"})
+    document = json.loads(path.read_text())
+    assert result.exit_code == 0
+    assert document["ok"] is True
+    checks = {check["name"]: check for check in document["checks"]}
+    for name in ("Python", "rclpy", "middleware", "pybullet", "open3d", "rosbags", "object models"):
+        assert checks[name]["ok"], checks[name]
+    for name in ("two nodes exchange a message", "ray casting a view", "writing and reading a bag"):
+        assert checks[name]["ok"], checks[name]
+        assert checks[name]["needed"]
+    assert all(check["mend"] for check in checks.values() if not check["ok"])
+    assert "The core path works." in result.stdout
+
+
+def test_a_missing_needed_library_is_exit_code_1(monkeypatch, tmp_path):
+    broken = [Check("A", "spoon", True, True, "1.0"), Check("A", "fork", False, True, "not there", "buy a fork")]
+    monkeypatch.setattr(doctor, "examine", lambda: iter(broken))
+    result = CliRunner().invoke(app, ["doctor", "--json", str(tmp_path / "doctor.json")])
+    assert result.exit_code == 1
+    assert "buy a fork" in result.stdout
+    assert "does not work: fork" in result.stdout
+    assert json.loads((tmp_path / "doctor.json").read_text())["ok"] is False
+
+
+@pytest.mark.parametrize(("needed", "expected"), [(True, False), (False, True)])
+def test_only_what_is_needed_counts(needed, expected):
+    assert works([Check("A", "a", True, True, ""), Check("A", "b", False, needed, "", "mend")]) is expected
+
+
+def test_a_library_that_breaks_while_loading_is_a_finding(tmp_path, monkeypatch):
+    (tmp_path / "brittle_library.py").write_text("raise OSError('libusb-1.0.so.0: cannot open\\nmore')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    check = doctor._import_check("A", "brittle_library", "brittle", needed=True, mend="mend it")
+    assert (check.ok, check.detail, check.mend) == (False, "libusb-1.0.so.0: cannot open", "mend it")
