@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from active6d_tools.report import results_tables as tables
+from active6d_tools.results import tables
 from active6d_tools.results.goals import CLAIMS, DEFAULT, GOALS, PAPERS, Measured, goals_table
 
 OBJECTS = ("coffee_cup", "bunny", "mug")
