@@ -44,7 +44,7 @@ def rows_of(markdown: str) -> dict[str, list[str]]:
 def test_the_page_is_what_its_files_say():
     text = (ROOT / "docs/results.md").read_text()
     assert page.fill(text, page.read_reports(ROOT)) == text, "run python -m active6d_tools.results.reproduce"
-    assert set(re.findall(r"<!-- results: ([\w ]+) -->", text)) == set(page.BLOCKS)
+    assert set(re.findall(r"<!-- results: ([\w -]+) -->", text)) == set(page.BLOCKS)
 
 
 @pytest.mark.parametrize("job", page.JOBS.values(), ids=list(page.JOBS))
