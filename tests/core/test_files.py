@@ -1,6 +1,8 @@
 from pathlib import Path
 
-from active6d_core.files import cache_folder, sha256_of
+import pytest
+
+from active6d_core.files import atomic_file, cache_folder, sha256_of, write_file
 
 
 def test_the_cache_follows_the_xdg_variable(monkeypatch, tmp_path):
@@ -13,3 +15,37 @@ def test_the_cache_follows_the_xdg_variable(monkeypatch, tmp_path):
 def test_sha256_is_the_published_one(tmp_path):
     (tmp_path / "weights").write_bytes(b"abc")  # FIPS 180-2, appendix B.1
     assert sha256_of(tmp_path / "weights") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "deep" / "result.npz"
+    write_file(path, "before")
+
+    def write_half():
+        with atomic_file(path) as unfinished:
+            unfinished.write_text("half")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        write_half()
+    assert path.read_text() == "before"
+    with atomic_file(path) as unfinished:
+        assert unfinished.suffix == ".npz"  # numpy appends it to other names
+        unfinished.write_text("after")
+        assert path.read_text() == "before"
+    assert path.read_text() == "after"
+    assert [item.name for item in path.parent.iterdir()] == ["result.npz"]
+
+
+def test_a_file_never_replaces_a_folder(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        write_file(tmp_path / "folder", b"text")
+    assert [item.name for item in tmp_path.iterdir()] == ["folder"]
+
+
+def test_everybody_may_read_a_written_file(tmp_path):
+    write_file(tmp_path / "picture.png", b"\x89PNG")
+    (tmp_path / "plain").touch()
+    assert (tmp_path / "picture.png").read_bytes() == b"\x89PNG"
+    assert (tmp_path / "picture.png").stat().st_mode == (tmp_path / "plain").stat().st_mode

@@ -9,7 +9,6 @@ one bit a cell of a grid over the bin.
 
 import json
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from active6d_core.camera import View
-from active6d_core.files import cache_folder
+from active6d_core.files import atomic_file, cache_folder
 from active6d_core.metrics import MISSED_E_ADD, e_add
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
@@ -242,10 +241,9 @@ class SceneBank:
             "provenance": self.provenance,
         }
         pairs = [np.nonzero(np.isfinite(scene.errors)) for scene in self.scenes]
-        unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
-        with unfinished.open("wb") as file:
+        with atomic_file(path) as unfinished:
             np.savez_compressed(
-                file,
+                unfinished,
                 header=json.dumps(header),
                 object_count=[len(scene.T_world_object) for scene in self.scenes],
                 T_world_object=np.concatenate([scene.T_world_object for scene in self.scenes]),
@@ -260,7 +258,6 @@ class SceneBank:
                 # compresses to a fraction of what cell by cell for each view does.
                 surface=[_transpose_bits(scene.surface, len(self.grid)) for scene in self.scenes],
             )
-        unfinished.replace(path)
 
 
 def cached_banks() -> Path:

@@ -8,15 +8,17 @@ from typing import TypeVar
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from active6d_core.files import atomic_file, write_file
+
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def save_weights(module: nn.Module, path: Path, policy: str, config: dict, provenance: dict | None = None) -> None:
     """Write ``path`` (.safetensors) and the configuration that :func:`load_weights` builds from beside it (.json)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_file({name: value.detach().cpu().clone() for name, value in module.state_dict().items()}, path)
+    with atomic_file(path) as unfinished:
+        save_file({name: value.detach().cpu().clone() for name, value in module.state_dict().items()}, unfinished)
     document = {"policy": policy, **config, "provenance": provenance or {}}
-    path.with_suffix(".json").write_text(json.dumps(document, indent=2) + "\n")
+    write_file(path.with_suffix(".json"), json.dumps(document, indent=2) + "\n")
 
 
 def load_weights(path: Path, policy: str, build: Callable[[dict], _Module]) -> _Module:

@@ -3,7 +3,6 @@
 Also tells what of the surface in the depth images the fused objects do not explain.
 """
 
-import os
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +13,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from active6d_core.camera import PinholeCamera
-from active6d_core.files import cache_folder
+from active6d_core.files import atomic_file, cache_folder
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.ros.conversions import (
@@ -186,11 +185,9 @@ def export_mesh(model: ObjectModel) -> str:
 
     The path depends on the object only, so that recorded markers are the same every time.
     """
-    folder = cache_folder("meshes")
-    folder.mkdir(parents=True, exist_ok=True)
-    path, unfinished = folder / f"{model.name}.stl", folder / f"{model.name}.{os.getpid()}.part"
-    model.mesh.export(unfinished, file_type="stl")
-    unfinished.replace(path)
+    path = cache_folder("meshes") / f"{model.name}.stl"
+    with atomic_file(path) as unfinished:
+        model.mesh.export(unfinished)
     return path.as_uri()
 
 

@@ -1,14 +1,12 @@
 """Heaps of identical objects, dropped by rigid-body physics into a bin until they rest."""
 
 import hashlib
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from active6d_core.files import cache_folder
+from active6d_core.files import atomic_file, cache_folder
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import transform_from_quaternion
 from active6d_sim.physics.bullet import BulletClient, connect, decompose, pybullet
@@ -168,13 +166,10 @@ def collision_file(model: ObjectModel) -> Path:
     """
     vertices = np.asarray(model.mesh.vertices)
     digest = hashlib.sha256(vertices.tobytes() + np.asarray(model.mesh.faces).tobytes()).hexdigest()[:16]
-    folder = cache_folder("collision")
-    path = folder / f"{model.name}-{digest}.obj"
+    path = cache_folder("collision") / f"{model.name}-{digest}.obj"
     if not path.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as temporary:
-            source, parts, log = (str(Path(temporary) / name) for name in ("mesh.obj", "parts.obj", "log.txt"))
+        with atomic_file(path) as parts:
+            source, log = (str(parts.with_name(name)) for name in ("mesh.obj", "log.txt"))
             model.mesh.export(source)
-            decompose(source, parts, log)
-            os.replace(parts, path)  # atomic, so that processes may race
+            decompose(source, str(parts), log)
     return path

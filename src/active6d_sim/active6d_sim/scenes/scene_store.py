@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from active6d_core.files import atomic_file
 from active6d_core.object_model import list_objects, load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.physics.heap import collision_file, drop_heap
@@ -92,7 +93,6 @@ def generate(
     if not missing:
         return
     collision_file(load_object(object_name))  # once, before every process makes its own
-    (folder / object_name).mkdir(parents=True, exist_ok=True)
     # Forking a process whose ray caster has started its threads would hang.
     with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn")) as pool:
         for done in as_completed([pool.submit(_store_scene, *job) for job in missing]):
@@ -101,9 +101,8 @@ def generate(
 
 def _store_scene(object_name: str, split: str, index: int, path: Path) -> Path:
     scene = drop_heap(load_object(object_name), SPLIT_SEEDS[split] + index, name=f"{object_name}/{split}/{index}")
-    unfinished = path.with_suffix(".part.npz")
-    replace(scene, visible_fraction=np.round(scene.visible_fraction, 3)).save(unfinished)
-    unfinished.replace(path)
+    with atomic_file(path) as unfinished:
+        replace(scene, visible_fraction=np.round(scene.visible_fraction, 3)).save(unfinished)
     return path
 
 

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_tools.cli.output import JsonFile, console, messages, write_file, write_json
+from active6d_core.files import write_file
+from active6d_tools.cli.output import JsonFile, console, messages, write_json
 
 if TYPE_CHECKING:
     from active6d_core.object_model import ObjectModel

@@ -1,9 +1,7 @@
 """What the subcommands share: the terminal, progress with time left, options, JSON with the versions that made it."""
 
 import json
-import os
 import platform
-import tempfile
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +9,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from active6d_core.files import write_file
 
 console = Console()
 #: Progress and notes, so that standard output holds results only.
@@ -54,25 +54,6 @@ def write_json(path: Path | None, result: dict[str, Any]) -> None:
     document = {**result, "versions": {"python": platform.python_version(), **_installed_versions()}}
     write_file(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
     messages.print(f"wrote {path}", highlight=False)
-
-
-def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file in one step, folders included: a reader never sees half of it.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    data = content.encode() if isinstance(content, str) else content
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
 
 
 def export_weights(best: Path, folder: Path, name: str) -> None:

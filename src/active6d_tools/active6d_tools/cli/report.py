@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from active6d_core.files import write_file
 from active6d_tools.cli.output import (
     BagFolder,
     BagObject,
     JsonFile,
     console,
     messages,
-    write_file,
     write_json,
 )
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from active6d_core.files import write_file
 from active6d_tools.cli.output import (
     JsonFile,
     ObjectName,
@@ -12,7 +13,6 @@ from active6d_tools.cli.output import (
     console,
     messages,
     progress_bar,
-    write_file,
     write_json,
 )
 

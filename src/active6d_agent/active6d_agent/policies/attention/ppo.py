@@ -21,6 +21,7 @@ from torch import nn
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.environment.gym_environment import Active6DVectorEnv, Episodes, RewardParameters
 from active6d_agent.policies.attention.network import ATTENTION_RULES, AttentionNetwork, ObjectAttention, save_network
+from active6d_core.files import atomic_file, write_file
 
 
 @dataclass(frozen=True)
@@ -300,8 +301,10 @@ def _checkpoint(ppo: PPO, folder: Path, state: dict) -> None:
     for index, moments in ppo.policy.optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": value for name, value in moments.items()}
     # Cloned, because the policy names its extractor three times and safetensors refuses shared memory.
-    save_file({name: value.detach().cpu().clone() for name, value in tensors.items()}, folder / "latest.safetensors")
-    (folder / "latest.json").write_text(json.dumps({**state, "steps": ppo.num_timesteps}, indent=2) + "\n")
+    cloned = {name: value.detach().cpu().clone() for name, value in tensors.items()}
+    with atomic_file(folder / "latest.safetensors") as unfinished:
+        save_file(cloned, unfinished)
+    write_file(folder / "latest.json", json.dumps({**state, "steps": ppo.num_timesteps}, indent=2) + "\n")
 
 
 def _restore(ppo: PPO, folder: Path, identity: dict) -> tuple[tuple[float, float], float]:

@@ -8,6 +8,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from active6d_core.files import atomic_file, write_file
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import is_rigid
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
@@ -39,13 +40,13 @@ class TrainedNetwork:
 
 def save_network(path: Path, trained: TrainedNetwork) -> None:
     """Write ``path`` (``.safetensors``, float16) and the JSON file of the same name beside it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     # Half precision halves the file; what it rounds away is far below the noise of training.
     tensors = {
         name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
         for name, tensor in trained.network.state_dict().items()
     }
-    save_file(tensors, path)
+    with atomic_file(path) as unfinished:
+        save_file(tensors, unfinished)
     description = {
         "format": _FORMAT,
         "object": trained.object_name,
@@ -57,7 +58,7 @@ def save_network(path: Path, trained: TrainedNetwork) -> None:
         "T_object_axis": trained.canonical_frame.T_object_axis.tolist(),
         "training": trained.training,
     }
-    path.with_suffix(".json").write_text(json.dumps(description, indent=1) + "\n")
+    write_file(path.with_suffix(".json"), json.dumps(description, indent=1) + "\n")
 
 
 def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:

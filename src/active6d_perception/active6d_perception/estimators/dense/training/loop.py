@@ -12,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from active6d_core.files import atomic_file, write_file
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.dense.canonical_frame import canonical_frame_of
 from active6d_perception.estimators.dense.network import DenseNetwork, NetworkSize, has_fast_bfloat16
@@ -138,7 +139,7 @@ def train(
                         averaged.network, canonical_frame, model.name, model.diameter, options.size, training
                     ),
                 )
-            (folder / "curves.json").write_text(json.dumps(run.history, indent=1) + "\n")
+            write_file(folder / "curves.json", json.dumps(run.history, indent=1) + "\n")
             draw_curves(run.history, folder / "curves.png", title=f"{model.name}: training of the dense estimator")
         if run.step % options.checkpoint_every == 0 or run.step == options.steps:
             run.save()
@@ -207,11 +208,10 @@ class _Run:
         for index, state in self._optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
         progress = {"step": self.step, "options": asdict(self._options), "history": self.history}
-        partial = self._state_file.with_suffix(".partial")
         # Tensors and progress are one file, so that they never disagree.
         contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        save_file(contiguous, partial, metadata={"progress": json.dumps(progress)})
-        partial.replace(self._state_file)
+        with atomic_file(self._state_file) as unfinished:
+            save_file(contiguous, unfinished, metadata={"progress": json.dumps(progress)})
 
     def _load(self) -> None:
         try:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from active6d_core.camera import PinholeCamera, View
+from active6d_core.files import atomic_file
 from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, ReducedView, reduce_view
 
 _DEPTH_UNIT = 1e-4  # metres; 16 bits reach 6.5 m
@@ -56,19 +57,18 @@ def write_shard(path: Path, samples: Sequence[Sample]) -> None:
     """Write samples of one size as a compressed ``.npz``; a half-written file never has the final name."""
     counts = [len(sample.T_camera_object) for sample in samples]
     cameras = [sample.view.camera for sample in samples]
-    partial = path.with_suffix(".partial.npz")
-    np.savez_compressed(
-        partial,
-        color=np.stack([sample.view.color for sample in samples]),
-        depth=np.stack([_pack_depth(sample.view.depth) for sample in samples]),
-        intrinsics=np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras]),
-        surface_depth=np.stack([_pack_depth(sample.surface_depth) for sample in samples]),
-        instance=np.stack([sample.instance for sample in samples]).astype(np.int16),
-        object_counts=counts,
-        T_camera_object=np.concatenate([sample.T_camera_object for sample in samples]),
-        visible_fraction=np.concatenate([sample.visible_fraction for sample in samples]).astype(np.float32),
-    )
-    partial.replace(path)
+    with atomic_file(path) as unfinished:
+        np.savez_compressed(
+            unfinished,
+            color=np.stack([sample.view.color for sample in samples]),
+            depth=np.stack([_pack_depth(sample.view.depth) for sample in samples]),
+            intrinsics=np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras]),
+            surface_depth=np.stack([_pack_depth(sample.surface_depth) for sample in samples]),
+            instance=np.stack([sample.instance for sample in samples]).astype(np.int16),
+            object_counts=counts,
+            T_camera_object=np.concatenate([sample.T_camera_object for sample in samples]),
+            visible_fraction=np.concatenate([sample.visible_fraction for sample in samples]).astype(np.float32),
+        )
 
 
 def read_shard(path: Path) -> list[Sample]:
