@@ -22,7 +22,7 @@ from active6d_perception.estimators.dense.canonical_frame import (
     canonical_frame_of,
     rotation_about_z,
 )
-from active6d_perception.estimators.dense.estimator import likely_axis_rotations
+from active6d_perception.estimators.dense.dense_estimator import likely_axis_rotations
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
 from active6d_perception.estimators.dense.network import DIRECTION_BINS, HEADS, DenseNetwork, NetworkSize, fused, split
 from active6d_perception.estimators.dense.network_input import (

@@ -13,7 +13,7 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, transform_points
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, canonical_frame_of
 from active6d_perception.estimators.dense.decoding import DecodingParameters
-from active6d_perception.estimators.dense.estimator import DenseEstimator, DenseParameters
+from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
 from active6d_perception.estimators.dense.network import HEADS, DenseNetwork, NetworkSize, split
 from active6d_perception.estimators.dense.network_input import output_camera, ray_frames, ray_rotation, reduction
 from active6d_perception.estimators.dense.sphere_bins import CENTRES

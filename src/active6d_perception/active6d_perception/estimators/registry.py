@@ -37,8 +37,8 @@ _registry = Registry(
     "estimator",
     choose_estimator,
     {
-        "dense": "active6d_perception.estimators.dense.estimator",
-        "geometric": "active6d_perception.estimators.geometric.estimator",
+        "dense": "active6d_perception.estimators.dense.dense_estimator",
+        "geometric": "active6d_perception.estimators.geometric.geometric_estimator",
     },
 )
 #: Decorates a factory ``(model, **parameters) -> Estimator``; see :meth:`active6d_core.registry.Registry.register`.

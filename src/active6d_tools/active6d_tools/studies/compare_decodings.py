@@ -12,7 +12,7 @@ from rich.progress import track
 from rich.table import Table
 
 from active6d_perception.estimators.dense.decoding import DecodingParameters
-from active6d_perception.estimators.dense.estimator import DenseParameters
+from active6d_perception.estimators.dense.dense_estimator import DenseParameters
 from active6d_perception.estimators.dense.training.validation import pose_rates
 from active6d_tools.studies.shard_arguments import read_arguments
 

@@ -14,7 +14,7 @@ from scipy.special import softmax
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
 from active6d_perception.estimators.dense.canonical_frame import TURNS, rotation_about_z
 from active6d_perception.estimators.dense.decoding import axis_rotation_probability, decode
-from active6d_perception.estimators.dense.estimator import DenseEstimator
+from active6d_perception.estimators.dense.dense_estimator import DenseEstimator
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
 from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera, pool_depth
 from active6d_perception.estimators.dense.training.samples import Sample

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from active6d_core.metrics import DETECTION_FRACTION, add_s, e_add, match
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation
-from active6d_perception.estimators.dense.estimator import DenseEstimator, DenseParameters
+from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
 from active6d_perception.estimators.dense.trained_network import TrainedNetwork
 from active6d_perception.estimators.dense.training.batches import input_tensor
 from active6d_perception.estimators.dense.training.losses import loss_terms
