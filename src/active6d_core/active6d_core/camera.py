@@ -5,6 +5,9 @@ from functools import lru_cache
 
 import numpy as np
 
+# Focal lengths over the longer side of the image: from fields of view of 136 degrees to those of 3 degrees.
+_FOCAL_LENGTHS = (0.2, 20.0)
+
 
 @dataclass(frozen=True)
 class PinholeCamera:
@@ -36,6 +39,33 @@ class PinholeCamera:
         """Square pixels, principal point at the image's centre."""
         focal = 0.5 * width / np.tan(0.5 * np.radians(horizontal_degrees))
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    @classmethod
+    def from_matrix(cls, matrix: np.ndarray, width: int, height: int) -> "PinholeCamera":
+        """The camera of a (3, 3) intrinsic matrix K in pixels, for images of ``width`` x ``height`` pixels.
+
+        Raises:
+            ValueError: K is not an intrinsic matrix without skew, or does not belong to images of this size.
+        """
+        K = np.asarray(matrix, float)
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise ValueError(f"K must be a finite (3, 3) intrinsic matrix, got shape {K.shape}")
+        expected = np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
+        if not np.allclose(K, expected, atol=1e-6 * max(1.0, np.abs(K).max())):
+            raise ValueError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew; is it transposed?")
+        camera = cls(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        low, high = (share * max(width, height) for share in _FOCAL_LENGTHS)
+        if not (low <= camera.fx <= high and low <= camera.fy <= high):
+            raise ValueError(
+                f"K has focal lengths {camera.fx:g} and {camera.fy:g} pixels, impossible for {width}x{height} images; "
+                "is K the identity, in millimetres, or of another image size?"
+            )
+        if not (0 < camera.cx < width and 0 < camera.cy < height):
+            raise ValueError(
+                f"K has its centre at ({camera.cx:g}, {camera.cy:g}), outside the {width}x{height} image; "
+                "is K of another image size?"
+            )
+        return camera
 
     @property
     def matrix(self) -> np.ndarray:

@@ -84,6 +84,15 @@ class Hypotheses:
         box = np.reshape(pixels, (-1, 4)) / (width, height, width, height)
         return cls(np.asarray(T_camera_object, float), np.asarray(score, float), box, depth, label, segmentation)
 
+    def take(self, index: np.ndarray) -> "Hypotheses":
+        """The hypotheses at ``index`` (integers or a mask), in that order; the segmentation stays whole."""
+        columns = {item.name: getattr(self, item.name)[index] for item in fields(self) if item.name != "segmentation"}
+        return replace(self, **columns)
+
+    def ranked(self) -> "Hypotheses":
+        """The same hypotheses, the highest score first."""
+        return self.take(np.argsort(-self.score, kind="stable"))
+
     @classmethod
     def empty(cls, height: int, width: int) -> "Hypotheses":
         """No hypothesis, for an image of the given size in pixels."""

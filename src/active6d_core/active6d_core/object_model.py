@@ -5,7 +5,7 @@ shipped with this package, so adding an object is adding a file. ``objects/READM
 """
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -55,6 +55,7 @@ class ObjectModel:
         color: (3,) RGB in [0, 1].
         features: name to (2, 3) axis-aligned box (min, max) in the object frame, naming a part of the surface
             (the mug's ``handle``) whose visibility decides whether the pose is ambiguous.
+        origin: (3,) the object frame's origin in the frame of the mesh file, metres.
     """
 
     name: str
@@ -64,6 +65,16 @@ class ObjectModel:
     instances: tuple[int, int]
     color: np.ndarray
     features: dict[str, np.ndarray]
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def T_camera_mesh(self, T_camera_object: np.ndarray) -> np.ndarray:
+        """(k, 4, 4) object poses as poses of the frame of the mesh file, scaled to metres.
+
+        Other tools that load the same mesh, such as those of BOP, expect poses in that frame.
+        """
+        T_object_mesh = np.eye(4)
+        T_object_mesh[:3, 3] = -self.origin
+        return np.asarray(T_camera_object) @ T_object_mesh
 
     @cached_property
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
@@ -134,7 +145,7 @@ def read_description(path: Path) -> ObjectModel:
     if description["name"] != path.stem:
         raise ValueError(f"{path}: name '{description['name']}' differs from the file's")
     try:
-        mesh = _load_mesh(description, path)
+        mesh, origin = _load_mesh(description, path)
         low, high = (int(count) for count in description["instances"])
         color = np.array(description["color"], float)
         if not (1 <= low <= high) or color.shape != (3,):
@@ -149,6 +160,7 @@ def read_description(path: Path) -> ObjectModel:
             features={
                 key: np.array(box, float).reshape(2, 3) for key, box in (description.get("features") or {}).items()
             },
+            origin=origin,
         )
     except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise ValueError(f"{path}: {error}") from error
@@ -166,8 +178,11 @@ def find_beside(file_name: str, shipped: Path) -> Path:
     return next((path for path in beside if path.is_file()), shipped / file_name)
 
 
-def _load_mesh(description: dict, path: Path) -> trimesh.Trimesh:
-    """The mesh of ``mesh`` (a file) or ``profile`` ((r, z) rows revolved about z), scaled, origin at its centroid."""
+def _load_mesh(description: dict, path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """The mesh of ``mesh`` (a file) or ``profile`` ((r, z) rows revolved about z), scaled, origin at its centroid.
+
+    Also returns (3,) that centroid in the file's frame, metres.
+    """
     if ("mesh" in description) == ("profile" in description):
         raise ValueError("needs either mesh (a file) or profile (rows of radius and height)")
     if "profile" in description:
@@ -184,8 +199,9 @@ def _load_mesh(description: dict, path: Path) -> trimesh.Trimesh:
     if not len(mesh.faces) or mesh.volume <= 0:
         raise ValueError("mesh has no faces, or its faces point inwards (negative volume)")
     # With the origin at the mass centre, physics needs no inertial offset and rotation errors do not leak into ADD.
-    mesh.apply_translation(-mesh.center_mass)
-    return mesh
+    origin = np.array(mesh.center_mass)
+    mesh.apply_translation(-origin)
+    return mesh, origin
 
 
 def _diameter(mesh: trimesh.Trimesh) -> float:

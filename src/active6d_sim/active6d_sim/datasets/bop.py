@@ -46,7 +46,8 @@ class BopScene:
         folder: where it lies.
         image_ids: (m) BOP's image numbers, ascending.
         cameras: (m) intrinsics.
-        T_world_camera: (m, 4, 4) poses of the optical frame in the recording's world, metres.
+        T_world_camera: (m, 4, 4) poses of the optical frame in the recording's world, metres; the identity where the
+            recording has none.
         depth_scale: (m) millimetres per step of the depth image.
         truth: (m) ground truth, None where the recording has none.
     """
@@ -59,8 +60,12 @@ class BopScene:
     truth: tuple[ImageTruth, ...] | None
 
     @classmethod
-    def load(cls, folder: str | Path) -> "BopScene":
+    def load(cls, folder: str | Path, needs_poses: bool = True) -> "BopScene":
         """Read and check everything but the pixels.
+
+        Args:
+            folder: of the scene.
+            needs_poses: refuse a recording without camera poses.
 
         Raises:
             ValueError: a file is missing or broken, or a key is missing or has a wrong value; the message names both.
@@ -72,11 +77,9 @@ class BopScene:
             raise ValueError(f"{path}: no image")
         cameras, poses, scales = [], [], []
         for image, entry in entries.items():
-            poses.append(invert(_read_pose(entry, "cam_R_w2c", "cam_t_w2c", path, image)))
-            if not np.linalg.norm(poses[-1][:3, 3]) > 1e-6:
-                raise ValueError(f"{path}: image {image}: cam_t_w2c puts the camera at the world's origin")
+            poses.append(_read_camera_pose(entry, path, image, needs_poses))
             scale = float(_numbers(entry, "depth_scale", 1, path, image)[0])
-            if scale <= 0:
+            if not scale > 0:
                 raise ValueError(f"{path}: image {image}: depth_scale must be positive, got {scale}")
             scales.append(scale)
             k = _numbers(entry, "cam_K", 9, path, image)
@@ -253,6 +256,16 @@ def _read_pose(entry: Any, rotation: str, translation: str, path: Path, image: i
         raise ValueError(f"{path}: image {image}: {rotation} is not a rotation")
     metres = 1e-3 * _numbers(entry, translation, 3, path, image)
     return transform_from_quaternion(quaternion_from_transform(make_transform(R, metres)), metres)
+
+
+def _read_camera_pose(entry: Any, path: Path, image: int, needed: bool) -> np.ndarray:
+    """(4, 4) ``T_world_camera`` in metres; the identity where the entry has none and none is needed."""
+    if not needed and isinstance(entry, dict) and not entry.keys() & {"cam_R_w2c", "cam_t_w2c"}:
+        return np.eye(4)
+    T_world_camera = invert(_read_pose(entry, "cam_R_w2c", "cam_t_w2c", path, image))
+    if not np.linalg.norm(T_world_camera[:3, 3]) > 1e-6:
+        raise ValueError(f"{path}: image {image}: cam_t_w2c puts the camera at the world's origin")
+    return T_world_camera
 
 
 def _image_path(folder: Path, kind: str, image: int) -> Path:

@@ -15,6 +15,7 @@ from active6d_tools.cli import (
     benchmark,
     doctor,
     episode,
+    estimate,
     estimator_benchmark,
     estimator_training,
     evaluate,
@@ -75,6 +76,7 @@ def show_help(ctx: typer.Context) -> None:
 
 app.command()(doctor.doctor)
 app.command()(episode.episode)
+app.command()(estimate.estimate)
 app.command()(replay.replay)
 app.command()(report.report)
 app.command()(bank.bank)

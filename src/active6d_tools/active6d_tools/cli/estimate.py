@@ -1,0 +1,108 @@
+"""``active6d estimate``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from active6d_tools.cli.output import JsonFile, ObjectName, console, messages, progress_bar, write_file, write_json
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from active6d_core.camera import View
+
+_BOX = "Use only depth inside a box: X_MIN Y_MIN Z_MIN X_MAX Y_MAX Z_MAX in metres, in the camera's optical frame."
+
+
+def estimate(
+    folder: Annotated[Path | None, typer.Argument(metavar="[FOLDER]", help="A scene folder in BOP format.")] = None,
+    object_name: ObjectName = "mug",
+    rgb: Annotated[Path | None, typer.Option(metavar="FILE", help="One colour image instead of a folder.")] = None,
+    depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Its depth image: 16 bits, or .npy.")] = None,
+    intrinsics: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Its intrinsics: JSON with K or cam_K, 9 numbers.")
+    ] = None,
+    depth_scale: Annotated[
+        float | None, typer.Option(min=0.0, help="Metres per unit of --depth; 0.001 for integers, else 1.")
+    ] = None,
+    estimator: Annotated[str, typer.Option(help="Estimator that finds the poses.")] = "auto",
+    depth_range: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--range", metavar="NEAR FAR", help="Use only these distances, metres."),
+    ] = None,
+    region: Annotated[tuple[float, float, float, float, float, float] | None, typer.Option(help=_BOX)] = None,
+    region_in_world: Annotated[
+        bool, typer.Option("--region-in-world", help="The box is in the world; the scene needs camera poses.")
+    ] = False,
+    object_id: Annotated[int, typer.Option(min=1, help="BOP's number of the object, for the CSV file.")] = 1,
+    min_score: Annotated[float, typer.Option(min=0.0, max=1.0, help="Draw only hypotheses of at least it.")] = 0.5,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")] = Path("estimates"),
+    json_file: JsonFile = None,
+) -> None:
+    """Estimate the poses of an object in recorded images.
+
+    Writes DIR/results.csv, a BOP results file with poses of the mesh file's frame in millimetres, and an overlay PNG of
+    every image.
+
+    Example: [bold]active6d estimate path/to/bop/scene --object coffee_cup --range 0.3 1.2 --out estimates[/bold]
+    """
+    import numpy as np
+
+    from active6d_perception.active6d import Active6D
+    from active6d_tools.image_estimation import Overlay, bop_csv, describe, estimate_images
+
+    if region_in_world and (region is None or folder is None):
+        raise ValueError("--region-in-world needs --region and a scene folder with camera poses")
+    scene_id, images = _read(folder, rgb, depth, intrinsics, depth_scale, region_in_world)
+    box = (np.array(region[:3]), np.array(region[3:])) if region is not None else None
+    with messages.status(f"loading the estimator of {object_name}"):
+        finder = Active6D(object_name, estimator)
+    overlay, results = Overlay(finder.model), []
+    with progress_bar() as bar:
+        task = bar.add_task("estimating", total=len(images))
+        found = estimate_images(
+            finder, scene_id, images, depth_range=depth_range, region=box, region_in_world=region_in_world
+        )
+        for result in found:
+            results.append(result)
+            shown = result.hypotheses.take(result.hypotheses.score >= min_score)
+            path = out / "overlays" / f"{result.image_id:06d}.png"
+            write_file(path, _png(overlay.draw(result.view, shown)))
+            bar.update(task, advance=1)
+    for result in results:
+        sure = int((result.hypotheses.score >= min_score).sum())
+        text = f"image {result.image_id:6}  hypotheses {len(result.hypotheses):3}  score >= {min_score:g}: {sure:3}"
+        console.print(f"{text}  {result.seconds:.2f} s", highlight=False)
+    write_file(out / "results.csv", bop_csv(results, finder.model, object_id))
+    messages.print(f"wrote {out / 'results.csv'} and {out / 'overlays'}", highlight=False, markup=False)
+    write_json(json_file, {"object": object_name, "estimator": estimator, "images": describe(results, finder.model)})
+
+
+def _read(
+    folder: Path | None,
+    rgb: Path | None,
+    depth: Path | None,
+    intrinsics: Path | None,
+    depth_scale: float | None,
+    needs_poses: bool,
+) -> tuple[int, list[tuple[int, "View"]]]:
+    """BOP's number of the scene, and numbered views."""
+    from active6d_tools.image_estimation import read_image, read_scene
+
+    single = (rgb, depth, intrinsics)
+    if folder is not None:
+        if any(path is not None for path in single):
+            raise ValueError("give either a scene folder, or --rgb, --depth and --intrinsics")
+        return read_scene(folder, needs_poses)
+    if rgb is None or depth is None or intrinsics is None:
+        raise ValueError("give a scene folder in BOP format, or all of --rgb, --depth and --intrinsics")
+    return 0, [(0, read_image(rgb, depth, intrinsics, depth_scale))]
+
+
+def _png(picture: "Image") -> bytes:
+    import io
+
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG")
+    return buffer.getvalue()

@@ -1,0 +1,191 @@
+"""An estimator on images from files: what is read, and the results as BOP CSV rows and overlays."""
+
+import csv
+import io
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from active6d_core.camera import View
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.object_model import ObjectModel
+from active6d_core.rgbd import make_view
+from active6d_perception.active6d import Active6D
+from active6d_sim.datasets.bop import BopScene
+from active6d_tools.report.drawing import ScoreScale
+from active6d_tools.report.silhouette import SilhouetteDrawer
+
+#: Columns of a results file of the BOP challenge.
+BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+
+
+@dataclass(frozen=True, eq=False)
+class ImageResult:
+    """What an estimator found in one image.
+
+    Attributes:
+        scene_id: BOP's number of the scene.
+        image_id: BOP's number of the image.
+        view: the whole view, before any crop.
+        hypotheses: in the optical frame, best score first.
+        seconds: of the estimator.
+    """
+
+    scene_id: int
+    image_id: int
+    view: View
+    hypotheses: Hypotheses
+    seconds: float
+
+
+def read_scene(folder: Path, needs_poses: bool = False) -> tuple[int, list[tuple[int, View]]]:
+    """The scene's number and the numbered views of a BOP scene folder, with or without camera poses.
+
+    Raises:
+        ValueError: the folder is no BOP scene, or an image is damaged; the message names the file.
+    """
+    scene = BopScene.load(folder, needs_poses)
+    name = folder.resolve().name
+    return int(name) if name.isdecimal() else 0, [(image, scene.view(i, 0)) for i, image in enumerate(scene.image_ids)]
+
+
+def read_image(rgb: Path, depth: Path, intrinsics: Path, depth_scale: float | None) -> View:
+    """One view from a colour file, a depth file and intrinsics.
+
+    Args:
+        rgb: picture of 8 bits a channel.
+        depth: 16-bit picture, or a ``.npy`` array.
+        intrinsics: JSON file with ``K`` or ``cam_K``: 9 numbers in pixels, row by row.
+        depth_scale: metres per unit of the depth file, None for 0.001 with integers and 1 with floating point.
+
+    Raises:
+        ValueError: a file is missing or damaged, or its content cannot be meant; the message names it.
+    """
+    color, distances = _read_array(rgb), _read_array(depth)
+    K = _read_matrix(intrinsics)
+    try:
+        return make_view(color, distances, K, depth_scale=depth_scale)
+    except ValueError as error:
+        raise ValueError(f"{rgb}, {depth}: {error}") from error
+
+
+def estimate_images(
+    estimator: Active6D,
+    scene_id: int,
+    images: Sequence[tuple[int, View]],
+    *,
+    depth_range: tuple[float, float] | None = None,
+    region: tuple[np.ndarray, np.ndarray] | None = None,
+    region_in_world: bool = False,
+) -> Iterator[ImageResult]:
+    """Run the estimator on numbered views; yields each result.
+
+    Raises:
+        ValueError: a view cannot be used; the message has the image's number.
+    """
+    for image_id, view in images:
+        started = time.perf_counter()
+        try:
+            found = estimator(
+                view.color,
+                view.depth,
+                view.camera,
+                depth_range=depth_range,
+                region=region,
+                T_world_camera=view.T_world_camera if region_in_world else None,
+            )
+        except ValueError as error:
+            raise ValueError(f"image {image_id}: {error}") from error
+        yield ImageResult(scene_id, image_id, view, found, time.perf_counter() - started)
+
+
+def bop_csv(results: Sequence[ImageResult], model: ObjectModel, object_id: int) -> str:
+    """Results as BOP's CSV: poses of the mesh file's frame in the camera, millimetres."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(BOP_COLUMNS)
+    for result in results:
+        T_camera_mesh = model.T_camera_mesh(result.hypotheses.T_camera_object)
+        for T, score in zip(T_camera_mesh, result.hypotheses.score, strict=True):
+            rotation = " ".join(f"{value:.9g}" for value in T[:3, :3].ravel())
+            translation = " ".join(f"{value:.6f}" for value in 1e3 * T[:3, 3])
+            writer.writerow(
+                [
+                    result.scene_id,
+                    result.image_id,
+                    object_id,
+                    f"{score:.6f}",
+                    rotation,
+                    translation,
+                    f"{result.seconds:.4f}",
+                ]
+            )
+    return file.getvalue()
+
+
+def describe(results: Sequence[ImageResult], model: ObjectModel) -> list[dict]:
+    """Results as JSON rows, one per image."""
+    return [
+        {
+            "image": result.image_id,
+            "seconds": result.seconds,
+            "hypotheses": [
+                {"score": float(score), "T_camera_mesh": T.tolist()}
+                for T, score in zip(
+                    model.T_camera_mesh(result.hypotheses.T_camera_object), result.hypotheses.score, strict=True
+                )
+            ],
+        }
+        for result in results
+    ]
+
+
+class Overlay:
+    """Draws hypotheses onto a view: outlines coloured by score, and the object's axes."""
+
+    def __init__(self, model: ObjectModel) -> None:
+        self._drawer = SilhouetteDrawer(model)
+        self._scale = ScoreScale(0.0, 1.0)
+
+    def draw(self, view: View, hypotheses: Hypotheses) -> Image.Image:
+        """A picture of the view's size with every hypothesis, the best on top."""
+        picture = Image.fromarray(view.color).convert("RGB")
+        pen = ImageDraw.Draw(picture)
+        order = np.argsort(hypotheses.score, kind="stable")
+        for T, score in zip(hypotheses.T_camera_object[order], hypotheses.score[order], strict=True):
+            outline = self._drawer.outline(T, view.camera, view.depth)
+            color = self._scale.color(float(score))
+            for polygon in outline.visible:
+                pen.line([*map(tuple, polygon), tuple(polygon[0])], fill=color, width=2)
+            if outline.axes is not None:
+                for tip, axis_color in zip(outline.axes[1:], ("#ff3b30", "#34c759", "#0a84ff"), strict=True):
+                    pen.line([tuple(outline.axes[0]), tuple(tip)], fill=axis_color, width=2)
+            if outline.center is not None:
+                pen.text(tuple(outline.center), f"{score:.2f}", fill="white", stroke_width=1, stroke_fill="black")
+        return picture
+
+
+def _read_array(path: Path) -> np.ndarray:
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    try:
+        if path.suffix == ".npy":
+            return np.load(path, allow_pickle=False)
+        with Image.open(path) as picture:
+            return np.array(picture)
+    # Pillow's decoders raise many kinds on damaged files, SyntaxError among them.
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable image ({error})") from error
+
+
+def _read_matrix(path: Path) -> np.ndarray:
+    try:
+        content = json.loads(path.read_text())
+        return np.reshape(np.array(content["K" if "K" in content else "cam_K"], float), (3, 3))
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{path}: needs 'K' or 'cam_K' with 9 numbers ({error})") from error
