@@ -1,6 +1,7 @@
 """The learned estimator learns: targets, files of views, losses, training, resuming, and what comes out of it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from active6d_core.camera import DEFAULT_CAMERA, View, backproject
 from active6d_core.metrics import e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, transform_points
+from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, canonical_frame_of
 from active6d_perception.estimators.dense.decoding import DecodingParameters
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
@@ -47,10 +49,12 @@ def view_of(name, seed=0, camera=DEFAULT_CAMERA, rotations=None):
     renderer = SceneRenderer(scene, model=model, threads=1)
     T_world_camera = look_at(EYE, np.zeros(3))
     seen = renderer.render(T_world_camera, camera)
-    truth = renderer.render(T_world_camera, camera.scaled(0.5 / reduction(camera)), object_coordinates=True)
+    truth = renderer.render(
+        T_world_camera, camera.scaled(0.5 / reduction(camera)), shaded=False, object_coordinates=True
+    )
     view = View(0, seen.color, seen.depth, camera, T_world_camera)
-    sample = make_sample(view, truth.depth, truth.instance, invert(T_world_camera) @ poses, np.ones(4))
-    return sample, truth.object_coordinates, view
+    item = TrainingView(view, truth.depth, truth.instance, invert(T_world_camera) @ poses, np.ones(4))
+    return make_sample(item), truth.object_coordinates, view
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +200,7 @@ def test_shards_come_back(tmp_path, mug_view):
 def test_truth_of_another_size_is_refused(mug_view):
     sample, _, view = mug_view
     with pytest.raises(ValueError, match="truth of a training view must be"):
-        make_sample(view, np.ones((10, 10)), np.ones((10, 10), int), sample.T_camera_object, np.ones(4))
+        make_sample(replace(sample, view=view, surface_depth=np.ones((10, 10))))
 
 
 def test_augmentation_keeps_the_truth_and_never_mirrors(mug_view):

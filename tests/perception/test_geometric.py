@@ -13,7 +13,6 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators import registry as estimator_module
-from active6d_perception.estimators.refinement import suppress
 from active6d_perception.estimators.registry import (
     choose_estimator,
     create_estimator,
@@ -22,6 +21,7 @@ from active6d_perception.estimators.registry import (
     weights_path,
 )
 from active6d_perception.estimators.single_view_evaluation import LabelledView, detection_over_views, evaluate_estimator
+from active6d_perception.suppression import suppress
 from active6d_sim.physics.heap import drop_heap
 from active6d_sim.rendering.simulator import Simulator
 

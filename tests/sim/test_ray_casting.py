@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from active6d_core.camera import pixel_rays
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, transform_points
+from active6d_sim.rendering import renderer as renderer_module
 from active6d_sim.rendering.renderer import SceneRenderer, visible_fractions
 from active6d_sim.scenes.scene import Bin
 
@@ -176,3 +177,13 @@ def test_looks_follow_the_seed_and_geometry_does_not():
     np.testing.assert_array_equal(views[0].color, views[1].color)
     assert (views[0].color != views[2].color).any()
     np.testing.assert_array_equal(views[0].depth, views[2].depth)
+
+
+def test_geometry_is_the_same_without_shading_and_ambient_light_is_not_computed(monkeypatch):
+    T_world_camera = look_at((0.3, -0.4, 0.6), (0, 0, 0))
+    shaded = SceneRenderer(three_mugs()).render(T_world_camera, CAMERA)
+    monkeypatch.setattr(renderer_module, "_ambient_openness", lambda *arguments: pytest.fail("computed and dropped"))
+    bare = SceneRenderer(three_mugs()).render(T_world_camera, CAMERA, shaded=False)
+    assert bare.color is None
+    for name in ("depth", "instance", "normals"):
+        np.testing.assert_array_equal(getattr(bare, name), getattr(shaded, name))

@@ -20,9 +20,10 @@ from active6d_core.metrics import MISSED_E_ADD, SceneScore, score_errors
 from active6d_core.se3 import invert
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
-from active6d_perception.scene.clustering import cluster_groups, suppress_neighbours
+from active6d_perception.scene.clustering import cluster_groups
 from active6d_perception.scene.fusion import FusionParameters, evidence, preference, project_features
 from active6d_perception.scene.observed_surface import explainer
+from active6d_perception.suppression import suppress_neighbours
 
 _NO_ROW = np.iinfo(np.int64).max
 # Groups of hypotheses are padded to the upper end of their range, so that few large ones do not cost all.

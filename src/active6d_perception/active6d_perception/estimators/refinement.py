@@ -138,26 +138,6 @@ def _point_to_plane_step(
     return moved
 
 
-def suppress(distance: np.ndarray, score: np.ndarray, radius: float) -> np.ndarray:
-    """Greedy non-maximum suppression.
-
-    Args:
-        distance: (k, k) metres between poses.
-        score: (k,).
-        radius: metres; of two poses closer than this only the better one stays, of equals the first.
-
-    Returns:
-        indices kept, best first.
-    """
-    free = np.ones(len(score), bool)
-    kept = []
-    for index in np.argsort(-score, kind="stable"):
-        if free[index]:
-            kept.append(index)
-            free &= distance[index] >= radius
-    return np.array(kept, np.intp)
-
-
 def claim_pixels(
     views: ModelViews,
     T_camera_object: np.ndarray,

@@ -1,4 +1,4 @@
-"""Average-linkage clustering of many small groups at once, and suppression of neighbours.
+"""Average-linkage clustering of many small groups at once.
 
 The fusion node clusters one scene at a time, the agent's training environment hundreds at a time; both call these
 functions, so that they cannot disagree.
@@ -88,24 +88,3 @@ def group(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     place = np.arange(sizes.max(initial=0))
     valid = place < sizes[:, None]
     return order[np.minimum(starts[:, None] + place, max(len(keys) - 1, 0))], valid
-
-
-def suppress_neighbours(positions: np.ndarray, valid: np.ndarray, exclusion: float) -> np.ndarray:
-    """Which items have no better one that stays within ``exclusion`` of them, in each of B lists.
-
-    Args:
-        positions: (B, n, 3) metres, best item first.
-        valid: (B, n) bool, which items exist.
-        exclusion: metres.
-
-    Returns:
-        (B, n) bool, which stay.
-    """
-    kept = valid.copy()
-    norm = (positions**2).sum(axis=-1)
-    squared = norm[:, :, None] + norm[:, None] - 2.0 * positions @ np.swapaxes(positions, 1, 2)
-    close = (squared < exclusion**2) & np.tri(positions.shape[1], k=-1, dtype=bool)
-    # Only what has a neighbour ahead can fall, and only in list order is it known which of those stay.
-    for index in np.flatnonzero(close.any(axis=(0, 2))):
-        kept[:, index] &= ~(close[:, index] & kept).any(axis=1)
-    return kept

@@ -16,8 +16,9 @@ from active6d_core.se3 import invert
 from active6d_perception.compiled import compiled
 from active6d_perception.model.model_views import ModelViews, model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
-from active6d_perception.scene.clustering import cluster, suppress_neighbours
+from active6d_perception.scene.clustering import cluster
 from active6d_perception.scene.observed_surface import EXPLAINED_WITHIN
+from active6d_perception.suppression import suppress_neighbours
 
 #: Ways to rank hypotheses, see :attr:`FusionParameters.rank_by`.
 RANKINGS = ("evidence", "confidence", "verification", "score")

@@ -5,7 +5,6 @@ Test scenes are never learned from: heaps to learn from are dropped from their o
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,10 +12,11 @@ from scipy.spatial.transform import Rotation
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import invert, look_at, make_transform
+from active6d_core.training_view import TrainingView
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.physics.heap import drop_heap
 from active6d_sim.rendering.appearance import Appearance
-from active6d_sim.rendering.renderer import RenderedView, SceneRenderer
+from active6d_sim.rendering.renderer import SceneRenderer
 from active6d_sim.rendering.sensor import SensorNoise, apply
 from active6d_sim.scenes.scene import Bin, Scene
 from active6d_sim.scenes.scene_store import load_scene
@@ -25,23 +25,6 @@ from active6d_sim.scenes.scene_store import load_scene
 FIRST_SEED = 1_000_000
 
 _VIEWS_PER_LOOK = 8  # a look costs as much as four views
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingView:
-    """One view as a sensor would see it, and the truth at a quarter of its resolution.
-
-    Attributes:
-        view: noisy colour and depth.
-        truth: what is really there, as ``view.camera.scaled(truth_scale)`` sees it.
-        T_camera_object: (n, 4, 4) poses of everything in the bin; ``truth.instance`` indexes them.
-        visible_fraction: (n,) share of each silhouette inside the picture that nothing covers.
-    """
-
-    view: View
-    truth: RenderedView
-    T_camera_object: np.ndarray
-    visible_fraction: np.ndarray
 
 
 def training_heap(model: ObjectModel, seed: int) -> Scene:
@@ -122,10 +105,12 @@ def _capture(
     rendered = renderer.render(T_world_camera, camera)
     color, depth = apply(rendered, camera, noise, rng)
     coarse = camera.scaled(truth_scale)
+    truth = renderer.render(T_world_camera, coarse, shaded=False)
     visible, whole = renderer.instance_layers(T_world_camera, coarse)
     return TrainingView(
         View(0, color, depth, camera, T_world_camera),
-        renderer.render(T_world_camera, coarse),
+        truth.depth,
+        truth.instance,
         invert(T_world_camera) @ renderer.scene.T_world_all,
         np.divide(visible, whole, out=np.zeros(len(visible)), where=whole > 0),
     )

@@ -1,10 +1,12 @@
 """Registered colour, depth, instance and normal images of a scene, by ray casting (Open3D's Embree).
 
 Everything in the scene is one triangle soup. What does not depend on the camera (ambient occlusion, textures, the
-instances' colours) is computed once a scene, so that a view costs one primary ray and at most one shadow ray a pixel.
+instances' colours) is computed once per scene, when the first colour image is asked for. A view then costs one primary
+ray and at most one shadow ray per pixel.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import open3d as o3d
@@ -34,7 +36,7 @@ class RenderedView:
     """What a perfect camera sees.
 
     Attributes:
-        color: (H, W, 3) uint8 RGB.
+        color: (H, W, 3) uint8 RGB; None where shading was not asked for.
         depth: (H, W) float32 metres along z, NaN where nothing is.
         instance: (H, W) int16 index into ``Scene.T_world_all`` (ground truth's objects first), -1 elsewhere.
         normals: (H, W, 3) float32 unit surface normals in the camera frame, smooth over curved surfaces, facing the
@@ -43,7 +45,7 @@ class RenderedView:
             None unless asked for.
     """
 
-    color: np.ndarray
+    color: np.ndarray | None
     depth: np.ndarray
     instance: np.ndarray
     normals: np.ndarray
@@ -92,22 +94,30 @@ class SceneRenderer:
         self._look = appearance or Appearance(seed=appearance_seed)
         self._threads = threads
         self._T_object_world = invert(scene.T_world_all).astype(np.float32)
-        soup = _build_soup(self.model.mesh, scene)
+        self._soup = soup = _build_soup(self.model.mesh, scene)
         self._caster = o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._caster.add_triangles(soup.vertices, soup.faces)
-        openness = _ambient_openness(self._caster, soup, threads)
         # One row more than there are faces: the row of rays that hit nothing.
         self._corner_normals = np.concatenate([soup.normals[soup.faces], np.zeros((1, 3, 3), np.float32)])
         self._face_normals = np.ascontiguousarray(self._corner_normals[:, 0])
-        self._openness = np.concatenate([openness[soup.faces], np.zeros((1, 3), np.float32)])
         self._material = np.append(soup.material, np.int16(_BACKDROP))
-        self._palette = self._make_palette(len(scene.T_world_all))
-        self._textures = self._look.textures().reshape(2, -1)
 
     def render(
-        self, T_world_camera: np.ndarray, camera: PinholeCamera = DEFAULT_CAMERA, *, object_coordinates: bool = False
+        self,
+        T_world_camera: np.ndarray,
+        camera: PinholeCamera = DEFAULT_CAMERA,
+        *,
+        shaded: bool = True,
+        object_coordinates: bool = False,
     ) -> RenderedView:
-        """One noise-free view from (4, 4) ``T_world_camera``."""
+        """One noise-free view.
+
+        Args:
+            T_world_camera: (4, 4) pose of the optical frame.
+            camera: intrinsics of all images.
+            shaded: whether to render the colour image, which takes most of the time.
+            object_coordinates: whether to render the image of that name.
+        """
         R = np.asarray(T_world_camera[:3, :3], np.float32)
         eye = np.asarray(T_world_camera[:3, 3], np.float32)
         directions = pixel_rays(camera).reshape(-1, 3) @ R.T
@@ -116,11 +126,15 @@ class SceneRenderer:
         points = eye + directions * np.where(hit, depth, 0)[:, None]
         material = self._material[face]
         on_object = np.flatnonzero(material >= _FIRST_INSTANCE)
-        normals, openness = self._interpolate(face, uv, on_object)
+        weights = _barycentric(uv)
+        normals = self._interpolate_normals(face, weights, on_object)
         away = on_object[np.einsum("ij,ij->i", normals[on_object], directions[on_object]) > 0]
         normals[away] *= -1
-        color = self._shade(points, normals, openness, material, directions)
         shape = (camera.height, camera.width)
+        color = None
+        if shaded:
+            openness = np.einsum("ij,ij->i", weights, self._openness[face])
+            color = self._shade(points, normals, openness, material, directions).reshape(*shape, 3)
         coordinates = None
         if object_coordinates:
             T = self._T_object_world[material[on_object] - _FIRST_INSTANCE]
@@ -128,7 +142,7 @@ class SceneRenderer:
             coordinates[on_object] = np.einsum("pij,pj->pi", T[:, :3, :3], points[on_object]) + T[:, :3, 3]
             coordinates = coordinates.reshape(*shape, 3)
         return RenderedView(
-            color.reshape(*shape, 3),
+            color,
             np.where(hit, depth, np.float32(np.nan)).reshape(shape),
             np.maximum(material - _FIRST_INSTANCE, -1).astype(np.int16).reshape(shape),
             (normals @ R).reshape(*shape, 3),
@@ -165,17 +179,31 @@ class SceneRenderer:
         face = np.minimum(answer["primitive_ids"].numpy(), len(self._material) - 1)
         return answer["t_hit"].numpy(), face, answer["primitive_uvs"].numpy()
 
-    def _interpolate(self, face: np.ndarray, uv: np.ndarray, on_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(p, 3) unit normals, smooth for the rays ``on_object``, and (p,) openness, at barycentric ``uv``."""
-        weights = np.empty((len(face), 3), np.float32)
-        weights[:, 1:] = uv
-        weights[:, 0] = 1 - uv[:, 0] - uv[:, 1]
-        openness = np.einsum("ij,ij->i", weights, self._openness[face])
+    @cached_property
+    def _openness(self) -> np.ndarray:
+        """(f + 1, 3) ambient openness at the corners of the faces."""
+        openness = _ambient_openness(self._caster, self._soup, self._threads)
+        return np.concatenate([openness[self._soup.faces], np.zeros((1, 3), np.float32)])
+
+    @cached_property
+    def _textures(self) -> np.ndarray:
+        """(2, texels) brightness factors of the table and of the tray."""
+        return self._look.textures().reshape(2, -1)
+
+    @cached_property
+    def _palette(self) -> np.ndarray:
+        """(materials, 3) linear colour of each material."""
+        fixed = np.array([self._look.backdrop, self._look.table_color, self._look.bin_color], np.float32)
+        instances = self._look.instance_colors(len(self.scene.T_world_all), self.model.color)
+        return np.concatenate([fixed, instances])
+
+    def _interpolate_normals(self, face: np.ndarray, weights: np.ndarray, on_object: np.ndarray) -> np.ndarray:
+        """(p, 3) unit normals at barycentric (p, 3) ``weights`` of the faces, smooth for the rays ``on_object``."""
         normals = self._face_normals[face]
         smooth = np.einsum("ij,ijk->ik", weights[on_object], self._corner_normals[face[on_object]])
         smooth /= np.maximum(np.sqrt(np.einsum("ij,ij->i", smooth, smooth)), 1e-6)[:, None]
         normals[on_object] = smooth
-        return normals, openness
+        return normals
 
     def _shade(
         self,
@@ -235,10 +263,6 @@ class SceneRenderer:
         fade = np.minimum((away[far] - _FADE_START) / (_TABLE_HALF_WIDTH - _FADE_START), 1)[:, None]
         light[table[far]] += fade * (backdrop - light[table[far]])
 
-    def _make_palette(self, count: int) -> np.ndarray:
-        fixed = np.array([self._look.backdrop, self._look.table_color, self._look.bin_color], np.float32)
-        return np.concatenate([fixed, self._look.instance_colors(count, self.model.color)])
-
 
 def visible_fractions(
     scene: Scene,
@@ -256,6 +280,14 @@ def visible_fractions(
     layers = [renderer.instance_layers(sphere.pose(position), camera) for position in sphere.positions]
     visible, whole = (np.array(counts, float).reshape(len(sphere), -1) for counts in zip(*layers, strict=True))
     return np.divide(visible, whole, out=np.zeros_like(visible), where=whole > 0)
+
+
+def _barycentric(uv: np.ndarray) -> np.ndarray:
+    """(p, 3) weights of a triangle's corners from the ray caster's (p, 2) coordinates."""
+    weights = np.empty((len(uv), 3), np.float32)
+    weights[:, 1:] = uv
+    weights[:, 0] = 1 - uv[:, 0] - uv[:, 1]
+    return weights
 
 
 def _rays(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -17,10 +17,11 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, make_transform
 from active6d_perception.estimators.geometric.foreground import Surface, measure_surface
-from active6d_perception.estimators.refinement import claim_pixels, suppress, weigh_evidence
+from active6d_perception.estimators.refinement import claim_pixels, weigh_evidence
 from active6d_perception.estimators.registry import Estimator
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
+from active6d_perception.suppression import suppress
 
 _REGISTRATION = o3d.pipelines.registration
 _FEWEST_POINTS = 50

@@ -129,11 +129,7 @@ def render_validation(object_name: str, index: int, path: Path) -> None:
 def _write(path: Path, views: Any) -> None:
     from active6d_perception.estimators.dense.training.samples import make_sample, write_shard
 
-    samples = [
-        make_sample(item.view, item.truth.depth, item.truth.instance, item.T_camera_object, item.visible_fraction)
-        for item in views
-    ]
-    write_shard(path, samples)
+    write_shard(path, [make_sample(item) for item in views])
 
 
 def _train(

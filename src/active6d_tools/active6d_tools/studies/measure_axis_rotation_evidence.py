@@ -11,13 +11,13 @@ import numpy as np
 from rich.progress import track
 from scipy.special import softmax
 
+from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
 from active6d_perception.estimators.dense.canonical_frame import TURNS, rotation_about_z
 from active6d_perception.estimators.dense.decoding import axis_rotation_probability, decode
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
 from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera, pool_depth
-from active6d_perception.estimators.dense.training.samples import Sample
 from active6d_perception.estimators.refinement import refine
 from active6d_perception.model.model_views import model_views
 from active6d_tools.studies.shard_arguments import read_arguments
@@ -27,7 +27,7 @@ RIGHT, WRONG, TOLERATED = np.radians([2.6, 30.0, 22.0])
 
 
 def count(
-    sample: Sample, estimator: DenseEstimator, search: AxisRotationSearch, canonical_frame
+    sample: TrainingView, estimator: DenseEstimator, search: AxisRotationSearch, canonical_frame
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, turns, 28) pixels by case, and (n,) true turn, of the instances whose centre and axis are right."""
     model, view = estimator.model, sample.view

@@ -4,11 +4,12 @@ import argparse
 from pathlib import Path
 
 from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.trained_network import TrainedNetwork, load_network
-from active6d_perception.estimators.dense.training.samples import Sample, read_shard
+from active6d_perception.estimators.dense.training.samples import read_shard
 
 
-def read_arguments(description: str, every: int) -> tuple[ObjectModel, TrainedNetwork, list[Sample]]:
+def read_arguments(description: str, every: int) -> tuple[ObjectModel, TrainedNetwork, list[TrainingView]]:
     """The object, its network, and every N-th view of the shards; ``every`` is the default of N."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("object")

@@ -24,7 +24,6 @@ from active6d_perception.estimators.dense.measured_surface import MeasuredSurfac
 from active6d_perception.estimators.dense.network import fused, has_fast_bfloat16
 from active6d_perception.estimators.dense.network_input import (
     OUTPUT_STRIDE,
-    ReducedView,
     network_input,
     output_camera,
     pad,
@@ -34,10 +33,11 @@ from active6d_perception.estimators.dense.network_input import (
 )
 from active6d_perception.estimators.dense.orientation_search import OrientationSearch
 from active6d_perception.estimators.dense.trained_network import TrainedNetwork, load_network
-from active6d_perception.estimators.refinement import claim_pixels, refine, suppress, weigh_evidence
+from active6d_perception.estimators.refinement import claim_pixels, refine, weigh_evidence
 from active6d_perception.estimators.registry import register_estimator, weights_path
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
+from active6d_perception.suppression import suppress
 
 # AxisRotationErrors this close to the chosen one count as the same answer when its certainty is told.
 _SAME_TURN = np.radians(30.0)
@@ -173,7 +173,7 @@ class DenseEstimator:
             view.depth,
         )
 
-    def locate(self, view: ReducedView) -> tuple[Poses, np.ndarray]:
+    def locate(self, view: View) -> tuple[Poses, np.ndarray]:
         """Poses in a reduced view, best first, and its (h, w) label image: 1 + ``Poses.instance``, 0 for none."""
         answer = self._timed("network", self.ask, view)
         depth = pool_depth(view.depth, OUTPUT_STRIDE)
@@ -196,7 +196,7 @@ class DenseEstimator:
         candidates = self._timed("poses", self._find_poses, instances, surface)
         return self._timed("judging", self._judge, *candidates, surface)
 
-    def ask(self, view: ReducedView) -> np.ndarray:
+    def ask(self, view: View) -> np.ndarray:
         """(channels, h, w) answer of the network, in memory channels last."""
         tensor = torch.from_numpy(pad(network_input(view, self.model.diameter)))[None]
         with torch.inference_mode():

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from active6d_core.camera import PinholeCamera, backproject, normals_from_points
+from active6d_core.camera import PinholeCamera, View, backproject, normals_from_points
 from active6d_perception.estimators.dense.decoding import Instances
-from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, ReducedView
+from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class MeasuredSurface:
     tree_normals: np.ndarray
 
     @classmethod
-    def of(cls, view: ReducedView, instances: Instances) -> "MeasuredSurface":
+    def of(cls, view: View, instances: Instances) -> "MeasuredSurface":
         """The surface of a view in which ``instances`` were found."""
         # The reduced depth is a mean of pixels already; smoothing it more rounds edges off and lets poses slide.
         points = backproject(view.depth, view.camera)

@@ -4,7 +4,7 @@ Distances come in diameters of the object and directions in the frame of the pix
 the same to the network wherever it is in the picture; only its apparent size tells how far away it is.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -27,34 +27,19 @@ _MOMENT_WINDOW = 17  # pixels: half of an object
 _SAME_SURFACE = 0.02  # relative difference of depth
 
 
-@dataclass(frozen=True, eq=False)
-class ReducedView:
-    """A view at the network's resolution.
-
-    Attributes:
-        color: (h, w, 3) uint8.
-        depth: (h, w) float32 metres, NaN where invalid.
-        camera: intrinsics of both.
-    """
-
-    color: np.ndarray
-    depth: np.ndarray
-    camera: PinholeCamera
-
-
 def reduction(camera: PinholeCamera) -> int:
     """The whole factor that a view of ``camera`` is reduced by."""
     return max(1, round(camera.width / INPUT_WIDTH))
 
 
-def reduce_view(view: View) -> ReducedView:
+def reduce_view(view: View) -> View:
     """Reduce a view to the network's resolution; what the factor does not divide is cut off at the right and bottom."""
     factor = reduction(view.camera)
     height, width = (size // factor for size in view.depth.shape)
     color = _pool_color(view.color, factor)
     exact = view.camera.scaled(1 / factor)
     camera = PinholeCamera(width, height, exact.fx, exact.fy, exact.cx, exact.cy)
-    return ReducedView(color, pool_depth(view.depth, factor), camera)
+    return replace(view, color=color, depth=pool_depth(view.depth, factor), camera=camera)
 
 
 def _pool_color(color: np.ndarray, factor: int) -> np.ndarray:
@@ -97,7 +82,7 @@ def pool_depth(depth: np.ndarray, factor: int) -> np.ndarray:
     return np.divide(total, count, out=np.full((height, width), np.nan, np.float32), where=count > 0)
 
 
-def network_input(view: ReducedView, diameter: float) -> np.ndarray:
+def network_input(view: View, diameter: float) -> np.ndarray:
     """The (CHANNELS, h, w) float32 tensor for one view, without padding.
 
     Args:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from active6d_perception.suppression import suppress
+
 _VOXEL = 0.06  # diameters
 _BANDWIDTH = 0.07  # diameters, of the mean shift's Gaussian kernel
 _SEED = 0.1  # diameters between the places that the shift starts from
@@ -73,13 +75,7 @@ def _affinity(a: np.ndarray, b: np.ndarray, bandwidth: float) -> np.ndarray:
 
 def _separate(modes: np.ndarray, density: np.ndarray, distance: float) -> np.ndarray:
     """Densest modes first, each at least ``distance`` from those before it."""
-    near = cdist(modes, modes, "sqeuclidean") < distance**2
-    free, kept = np.ones(len(modes), bool), []
-    for index in np.argsort(-density, kind="stable"):
-        if free[index]:
-            kept.append(index)
-            free &= ~near[index]
-    return modes[kept]
+    return modes[suppress(cdist(modes, modes, "sqeuclidean"), density, distance**2)]
 
 
 def _nearest(votes: np.ndarray, centre: np.ndarray, reach: float) -> np.ndarray:

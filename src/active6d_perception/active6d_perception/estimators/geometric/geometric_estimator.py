@@ -10,10 +10,11 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.geometric.foreground import Surface, measure_surface
 from active6d_perception.estimators.geometric.pair_voting import PairVoting
-from active6d_perception.estimators.refinement import Evidence, claim_pixels, refine, suppress, weigh_evidence
+from active6d_perception.estimators.refinement import Evidence, claim_pixels, refine, weigh_evidence
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
+from active6d_perception.suppression import suppress
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from active6d_core.camera import PinholeCamera
-from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, ReducedView
-from active6d_perception.estimators.dense.training.samples import Sample
+from active6d_core.camera import PinholeCamera, View
+from active6d_core.training_view import TrainingView
+from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE
 
 
-def augment(view: ReducedView, rng: np.random.Generator) -> ReducedView:
+def augment(view: View, rng: np.random.Generator) -> View:
     """Another colour balance, exposure, contrast and grain, and some depth missing or coarser."""
     color = view.color.astype(np.float32) / 255
     color = color ** rng.uniform(0.7, 1.4) * rng.uniform(0.75, 1.25) * rng.uniform(0.85, 1.15, 3).astype(np.float32)
@@ -21,7 +21,7 @@ def augment(view: ReducedView, rng: np.random.Generator) -> ReducedView:
     return replace(view, color=np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8), depth=depth)
 
 
-def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> Sample:
+def crop(sample: TrainingView, height: int, width: int, rng: np.random.Generator) -> TrainingView:
     """A window of the view around a random object pixel: most of a view is table, which teaches little.
 
     Args:
@@ -45,7 +45,7 @@ def crop(sample: Sample, height: int, width: int, rng: np.random.Generator) -> S
         camera.cx - fine[1].start,
         camera.cy - fine[0].start,
     )
-    view = ReducedView(sample.view.color[fine], sample.view.depth[fine], cropped)
+    view = replace(sample.view, color=sample.view.color[fine], depth=sample.view.depth[fine], camera=cropped)
     return replace(sample, view=view, surface_depth=sample.surface_depth[coarse], instance=sample.instance[coarse])
 
 

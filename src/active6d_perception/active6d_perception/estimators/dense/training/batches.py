@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import CanonicalFrame
 from active6d_perception.estimators.dense.network_input import network_input, pad
 from active6d_perception.estimators.dense.training.augmentation import augment, crop
-from active6d_perception.estimators.dense.training.samples import Sample, read_shard
+from active6d_perception.estimators.dense.training.samples import read_shard
 from active6d_perception.estimators.dense.training.targets import Targets, make_targets
 
 #: Files read together; their views are mixed before they are used.
@@ -51,7 +52,7 @@ class TrainingViews(IterableDataset):
                 for index in rng.permutation(len(samples)):
                     yield self._prepare(samples[index], rng)
 
-    def _prepare(self, sample: Sample, rng: np.random.Generator) -> tuple[Tensor, Targets]:
+    def _prepare(self, sample: TrainingView, rng: np.random.Generator) -> tuple[Tensor, Targets]:
         sample = crop(sample, *_WINDOW, rng)
         view = augment(sample.view, rng)
         return input_tensor(view, self._diameter), make_targets(sample, self._gauge, self._diameter)

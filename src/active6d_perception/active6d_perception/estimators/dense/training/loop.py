@@ -14,13 +14,13 @@ from torch import Tensor, nn
 
 from active6d_core.files import atomic_file, write_file
 from active6d_core.object_model import ObjectModel
+from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import canonical_frame_of
 from active6d_perception.estimators.dense.network import DenseNetwork, NetworkSize, has_fast_bfloat16
 from active6d_perception.estimators.dense.trained_network import TrainedNetwork, save_network
 from active6d_perception.estimators.dense.training.batches import TrainingViews, batches
 from active6d_perception.estimators.dense.training.curves import draw_curves
 from active6d_perception.estimators.dense.training.losses import LossWeights, loss_terms, total
-from active6d_perception.estimators.dense.training.samples import Sample
 from active6d_perception.estimators.dense.training.validation import validate
 
 _CLIP = 1.0  # norm of the gradient
@@ -89,7 +89,7 @@ class Report:
 def train(
     model: ObjectModel,
     shards: Sequence[Path],
-    validation: Sequence[Sample],
+    validation: Sequence[TrainingView],
     folder: Path,
     options: TrainingOptions,
     device: str = "cpu",

@@ -1,59 +1,35 @@
 """Training views at the network's resolution, and the files that hold them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.files import atomic_file
-from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, ReducedView, reduce_view
+from active6d_core.training_view import TrainingView
+from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, reduce_view
 
 _DEPTH_UNIT = 1e-4  # metres; 16 bits reach 6.5 m
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """One view to learn from.
-
-    Attributes:
-        view: what the sensor saw, at the network's input resolution.
-        surface_depth: (h, w) float32 true depth in metres at the network's output resolution, NaN where nothing is.
-        instance: (h, w) int16 index of the pixel's object, -1 where there is none.
-        T_camera_object: (n, 4, 4) true poses.
-        visible_fraction: (n,) share of each silhouette in the picture that nothing covers.
-    """
-
-    view: ReducedView
-    surface_depth: np.ndarray
-    instance: np.ndarray
-    T_camera_object: np.ndarray
-    visible_fraction: np.ndarray
-
-
-def make_sample(
-    view: View,
-    surface_depth: np.ndarray,
-    instance: np.ndarray,
-    T_camera_object: np.ndarray,
-    visible_fraction: np.ndarray,
-) -> Sample:
-    """Reduce a view and check that the truth, which comes at the network's output resolution, fits to it.
+def make_sample(item: TrainingView) -> TrainingView:
+    """The training view at the network's input resolution; its truth must have the network's output resolution.
 
     Raises:
         ValueError: the truth has another size.
     """
-    reduced = reduce_view(view)
+    reduced = reduce_view(item.view)
     expected = tuple(size // OUTPUT_STRIDE for size in reduced.depth.shape)
-    if surface_depth.shape != expected or instance.shape != expected:
+    if item.surface_depth.shape != expected or item.instance.shape != expected:
         raise ValueError(
-            f"the truth of a training view must be {expected}, got {surface_depth.shape} and {instance.shape}"
+            f"the truth of a training view must be {expected}, got {item.surface_depth.shape} and {item.instance.shape}"
         )
-    return Sample(reduced, surface_depth, instance, T_camera_object, visible_fraction)
+    return replace(item, view=reduced)
 
 
-def write_shard(path: Path, samples: Sequence[Sample]) -> None:
+def write_shard(path: Path, samples: Sequence[TrainingView]) -> None:
     """Write samples of one size as a compressed ``.npz``; a half-written file never has the final name."""
     counts = [len(sample.T_camera_object) for sample in samples]
     cameras = [sample.view.camera for sample in samples]
@@ -71,8 +47,8 @@ def write_shard(path: Path, samples: Sequence[Sample]) -> None:
         )
 
 
-def read_shard(path: Path) -> list[Sample]:
-    """Read what :func:`write_shard` wrote.
+def read_shard(path: Path) -> list[TrainingView]:
+    """Read what :func:`write_shard` wrote. Files hold no camera pose, so the camera's frame is the world.
 
     Raises:
         ValueError: the file is missing, damaged or something else; the message names it.
@@ -83,11 +59,13 @@ def read_shard(path: Path) -> list[Sample]:
         ends = np.cumsum(data["object_counts"])
         height, width = data["depth"].shape[1:]
         return [
-            Sample(
-                ReducedView(
+            TrainingView(
+                View(
+                    0,
                     data["color"][i],
                     _unpack_depth(data["depth"][i]),
                     PinholeCamera(width, height, *data["intrinsics"][i].tolist()),
+                    np.eye(4),
                 ),
                 _unpack_depth(data["surface_depth"][i]),
                 data["instance"][i],

@@ -6,11 +6,11 @@ import numpy as np
 
 from active6d_core.camera import pixel_rays
 from active6d_core.se3 import invert
+from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
 from active6d_perception.estimators.dense.network import DIRECTION_BINS
 from active6d_perception.estimators.dense.network_input import output_camera, ray_frames, ray_rotation
 from active6d_perception.estimators.dense.sphere_bins import kernel
-from active6d_perception.estimators.dense.training.samples import Sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Targets:
     direction: np.ndarray
 
 
-def make_targets(sample: Sample, canonical_frame: CanonicalFrame, diameter: float) -> Targets:
+def make_targets(sample: TrainingView, canonical_frame: CanonicalFrame, diameter: float) -> Targets:
     """Targets of one sample.
 
     Args:

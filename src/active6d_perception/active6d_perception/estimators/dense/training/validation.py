@@ -8,19 +8,19 @@ from scipy.spatial import cKDTree
 
 from active6d_core.metrics import DETECTION_FRACTION, add_s, e_add, match
 from active6d_core.object_model import ObjectModel
+from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
 from active6d_perception.estimators.dense.trained_network import TrainedNetwork
 from active6d_perception.estimators.dense.training.batches import input_tensor
 from active6d_perception.estimators.dense.training.losses import loss_terms
-from active6d_perception.estimators.dense.training.samples import Sample
 from active6d_perception.estimators.dense.training.targets import make_targets
 
 #: Visible fractions from which on an object has to be found, by the name of the rate.
 _VISIBLE = {"half": 0.5, "tenth": 0.1}
 
 
-def validate(model: ObjectModel, trained: TrainedNetwork, samples: Sequence[Sample]) -> dict[str, float]:
+def validate(model: ObjectModel, trained: TrainedNetwork, samples: Sequence[TrainingView]) -> dict[str, float]:
     """:func:`pose_rates` of a network, and ``loss_<term>`` without augmentation."""
     return {**pose_rates(model, trained, samples), **_losses(model, trained, samples)}
 
@@ -28,7 +28,7 @@ def validate(model: ObjectModel, trained: TrainedNetwork, samples: Sequence[Samp
 def pose_rates(
     model: ObjectModel,
     trained: TrainedNetwork,
-    samples: Sequence[Sample],
+    samples: Sequence[TrainingView],
     parameters: DenseParameters = DenseParameters(),
 ) -> dict[str, float]:
     """Rates in [0, 1] over all views together.
@@ -78,7 +78,7 @@ def _near_add_s(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, limit: 
     return errors
 
 
-def _losses(model: ObjectModel, trained: TrainedNetwork, samples: Sequence[Sample]) -> dict[str, float]:
+def _losses(model: ObjectModel, trained: TrainedNetwork, samples: Sequence[TrainingView]) -> dict[str, float]:
     totals: dict[str, float] = {}
     with torch.inference_mode():
         for sample in samples:
