@@ -16,6 +16,10 @@ from active6d_core.metrics import evaluate_scene
 from active6d_perception.scene.fusion import RANKINGS
 
 
+def by_variant(rows):
+    return {row["variant"]: row for row in rows}
+
+
 @pytest.fixture(scope="module")
 def lookup():
     return BatchedFusion(synthetic_bank("mug", scenes=2, objects=6))
@@ -27,7 +31,8 @@ def starts(lookup):
 
 
 def test_budgets_go_from_the_single_view_to_all_views(lookup, starts):
-    rows = {(name, budget): row for name, budget, row in ablation.ablate_steps(lookup, ["random"], starts, (0, 3, 99))}
+    made = ablation.ablate_steps(lookup, ["random"], starts, (0, 3, 99))
+    rows = {(row["variant"], row["budget"]): row for row in made}
     for budget, name in ((0, "single-view"), (99, "all-views")):
         expected = run_named(lookup, name, starts, budget)
         assert rows["random", budget]["detection_rate"] == pytest.approx(expected.detection_rate.mean())
@@ -35,7 +40,7 @@ def test_budgets_go_from_the_single_view_to_all_views(lookup, starts):
 
 
 def test_without_clustering_every_hypothesis_is_reported(lookup, starts):
-    rows = dict(ablation.ablate_fusion(lookup.bank, "random", starts, 2))
+    rows = by_variant(ablation.ablate_fusion(lookup.bank, "random", starts, 2))
     views = run_named(lookup, "random", starts, 2).views
     reported, rates = [], []
     for (scene, _), taken in zip(starts, views, strict=True):
@@ -51,13 +56,13 @@ def test_without_clustering_every_hypothesis_is_reported(lookup, starts):
 
 
 def test_what_hypotheses_are_ranked_by_matters_where_the_scores_differ(lookup, starts):
-    rows = dict(ablation.ablate_fusion(lookup.bank, "random", starts, 2, scores=True))
+    rows = by_variant(ablation.ablate_fusion(lookup.bank, "random", starts, 2, scores=True))
     # The made-up estimator's score is its verification score, so nothing may change.
-    assert rows["verification"] == rows["score"]
+    assert {**rows["verification"], "variant": "score"} == rows["score"]
     reversed_ = [replace(s, table=s.table.copy()) for s in lookup.bank.scenes]
     for scene in reversed_:
         scene.table[:, 8] = 1.0 - scene.table[:, 7]
-    worse = dict(ablation.ablate_fusion(replace(lookup.bank, scenes=reversed_), "random", starts, 2, scores=True))
+    worse = by_variant(ablation.ablate_fusion(replace(lookup.bank, scenes=reversed_), "random", starts, 2, scores=True))
     assert list(worse) == list(RANKINGS)
     alone = (table["verification"] | {"against_first": None} for table in (worse, rows))
     assert next(alone) == next(alone)
@@ -72,7 +77,7 @@ def test_variants_are_trained_once(lookup, starts, tmp_path):
         "rule": (replace(parameters, attend="lowest-score"), RewardParameters()),
     }
     seen = []
-    rows = dict(
+    rows = by_variant(
         ablation.ablate_training(banks, variants, tmp_path, starts, on_progress=lambda *told: seen.append(told[0]))
     )
     assert set(seen) == {"far", "rule"}
@@ -81,9 +86,9 @@ def test_variants_are_trained_once(lookup, starts, tmp_path):
     difference = rows["rule"]["detection_rate"] - rows["far"]["detection_rate"]
     assert rows["rule"]["against_first"]["detection_rate"]["mean"] == pytest.approx(difference)
     seen.clear()
-    assert dict(ablation.ablate_training(banks, variants, tmp_path, starts)) == rows
+    assert by_variant(ablation.ablate_training(banks, variants, tmp_path, starts)) == rows
     renamed = {"elsewhere": variants["rule"], "printed": (parameters, RewardParameters(as_printed=True))}
-    again = dict(
+    again = by_variant(
         ablation.ablate_training(banks, renamed, tmp_path, starts, on_progress=lambda *told: seen.append(told))
     )
     assert again["elsewhere"]["e_add_mm"] == rows["rule"]["e_add_mm"]
@@ -95,14 +100,14 @@ def test_planning_varies_one_parameter_of_the_default_policy(lookup, starts, tmp
     save_network(ViewAttention(), weights, "mug")
     monkeypatch.setattr(ablation, "PLANNING", {"metres_weight": (0.0, 100.0), "stop_below": (1e6,)})
     made = list(ablation.ablate_planning(lookup, starts, 3, parameters={"weights": str(weights)}))
-    assert [(name, value) for name, value, _ in made] == [
+    assert [(row["parameter"], row["value"]) for row in made] == [
         ("as shipped", None),
         ("metres_weight", 0.0),
         ("metres_weight", 100.0),
         ("stop_below", 1e6),
         ("random", None),
     ]
-    _, free, costly, stopped, random = (row for _, _, row in made)
+    _, free, costly, stopped, random = made
     grid = lookup.sphere
     nearest = np.sort(grid.arc(grid.positions[:, None], grid.positions[None]), axis=1)[:, 1].mean()
     assert costly["distance_m"] < min(free["distance_m"], 6 * nearest)

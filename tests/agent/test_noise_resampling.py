@@ -26,10 +26,8 @@ def starts(lookups):
 
 @pytest.fixture(scope="module")
 def rows(lookups, starts):
-    return {
-        (name, noise): row
-        for name, noise, row in ablate_noise_resampling(lookups, ["lowest-score"], starts, STEPS, seed=4)
-    }
+    made = ablate_noise_resampling(lookups, ["lowest-score"], starts, STEPS, seed=4)
+    return {(row["policy"], row["noise"]): row for row in made}
 
 
 def test_views_are_scored_on_both_banks_and_both_ways_round(lookups, starts, rows):
@@ -60,10 +58,9 @@ def test_who_does_not_look_has_no_luck_and_the_oracle_has(rows):
 
 
 def test_without_other_noise_nothing_is_luck(lookups, starts):
-    rows = {
-        noise: row for name, noise, row in ablate_noise_resampling((lookups[0],) * 2, [], starts, 2) if name == "oracle"
-    }
-    assert {row["gap_closed"] for row in rows.values()} == {1.0}
+    rows = [row for row in ablate_noise_resampling((lookups[0],) * 2, [], starts, 2) if row["policy"] == "oracle"]
+    assert [row["noise"] for row in rows] == ["own", "unforeseen", "other"]
+    assert {row["gap_closed"] for row in rows} == {1.0}
     foreseen = [search_views(lookups[0], *start, 2) for start in starts.tolist()]
     same = join_banks(lookups[0].bank, lookups[0].bank)
     np.testing.assert_array_equal(search_unforeseen(same, starts, 2), foreseen)

@@ -1,5 +1,6 @@
 """The command's manners: help with examples, one clear line and exit code 2 on bad input, a quick start."""
 
+import ast
 import json
 import subprocess
 import sys
@@ -12,10 +13,11 @@ import typer
 from PIL import Image
 from typer.testing import CliRunner
 
+import active6d_tools.cli
 from active6d_core.se3 import make_transform
 from active6d_sim.scenes.scene import Bin, Scene
 from active6d_tools.cli import app
-from active6d_tools.cli.episode import parse_overrides
+from active6d_tools.cli.options import parse_overrides
 from active6d_tools.cli.output import write_json
 
 
@@ -30,6 +32,15 @@ def commands(group: typer.core.TyperGroup, path: tuple[str, ...] = ()) -> list[t
     return found
 
 
+NO_ROS = """
+class NoRos:
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        if top in ("rclpy", "rcl_interfaces", "builtin_interfaces", "rosbags") or top.endswith(("_msgs", "_srvs")):
+            raise ModuleNotFoundError(f"no ROS here, and {name} was imported")
+
+sys.meta_path.insert(0, NoRos())
+"""
 COMMANDS = commands(typer.main.get_command(app))
 
 
@@ -212,3 +223,48 @@ def test_scenes_show_draws_the_views(tmp_path):
     assert result.exit_code == 0
     assert "azimuth  90°   elevation 45°" in result.stdout
     assert Image.open(tmp_path / "scene.png").size == (1280, 960)
+
+
+def test_commands_import_no_other_command():
+    folder = Path(active6d_tools.cli.__file__).parent
+    shared = {"options", "output", "progress", "terminal"}
+    for path in folder.glob("*.py"):
+        imported = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module == "active6d_tools.cli":
+                imported |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module.startswith("active6d_tools.cli."):
+                imported.add(node.module.split(".")[2])
+            elif isinstance(node, ast.Import):
+                names = [alias.name.split(".") for alias in node.names]
+                imported |= {name[2] for name in names if name[:2] == ["active6d_tools", "cli"] and len(name) > 2}
+        assert path.stem == "__init__" or imported <= shared, f"{path.name} imports {sorted(imported - shared)}"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train", "policy", "--banks", "/nowhere"],
+        ["train", "estimator", "--object", "teapot"],
+        ["bank", "--estimator", "psychic"],
+        ["evaluate", "--policies", "psychic"],
+        ["ablate", "steps", "--policies", "psychic"],
+        ["benchmark", "environment", "--banks", "/nowhere"],
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_training_needs_no_ros(arguments):
+    """Everything is imported and runs until the wrong argument is found, with rclpy and its messages blocked."""
+    code = f"import sys\n{NO_ROS}\nfrom active6d_tools.cli import main\nsys.argv = ['active6d', *{arguments}]\nmain()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 2, done.stderr
+    assert arguments[-1] in done.stderr
+    assert "no ROS here" not in done.stderr
+
+
+def test_work_is_done_outside_the_commands():
+    """What commands share and what other packages could use is importable without Typer."""
+    code = "import sys; sys.modules['typer'] = None; import " + ", ".join(
+        f"active6d_tools.{name}" for name in ("bank_building", "policy_training", "training_data", "threads", "report")
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=100)

@@ -10,8 +10,8 @@ from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import bank_path, find_bank, load_bank
 from active6d_agent.evaluation.policy_evaluation import all_starts, run_named
 from active6d_perception.scene.fusion import RANKINGS
+from active6d_tools import bank_building
 from active6d_tools.cli import app
-from active6d_tools.cli import bank as bank_command
 
 
 def run(*arguments: str):
@@ -64,7 +64,7 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
         assert observe.keywords == {"estimator": "dense", "noise": 1.0, "seed": 0}
         return real(path, object_name, names, partial(observe_synthetic, log=str(log)), **keywords)
 
-    monkeypatch.setattr(bank_command, "observe_scene_by_name", len)
+    monkeypatch.setattr(bank_building, "observe_scene_by_name", len)
     monkeypatch.setattr(bank_module, "build_bank", build)
     arguments = ("bank", "--object", "mug", "--split", "val", "--workers", "1", "--banks", str(tmp_path))
     result = run(*arguments, "--scenes", "2", "--json", str(tmp_path / "bank.json"))
@@ -85,9 +85,8 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
 
 def test_no_heap_is_in_two_splits():
     from active6d_sim.scenes.scene_store import FIRST_STORED_SEED
-    from active6d_tools.cli.bank import _scene_names
 
-    train, validation = (_scene_names("mug", split, None, 200) for split in ("train", "val"))
+    train, validation = (bank_building.scene_names("mug", split, None, 200) for split in ("train", "val"))
     assert (len(train), len(validation)) == (224, 206)
     assert not set(train) & set(validation)
     dropped = [int(name.split("/")[-1]) for name in train + validation if "/seed/" in name]
@@ -104,8 +103,8 @@ def test_a_scene_is_seen_as_the_graph_sees_it(monkeypatch):
     from active6d_sim.scenes.scene_store import load_scene
 
     sphere = ViewSphere(elevations_degrees=(60.0,), azimuths=2)
-    monkeypatch.setattr("active6d_core.view_sphere.ViewSphere", lambda: sphere)
-    made = bank_command.observe_scene_by_name("bunny/test/0", estimator="geometric", noise=1.0, seed=5)
+    monkeypatch.setattr(bank_building, "ViewSphere", lambda: sphere)
+    made = bank_building.observe_scene_by_name("bunny/test/0", estimator="geometric", noise=1.0, seed=5)
     scene, model = load_scene("bunny", "test", 0), load_object("bunny")
     view = Simulator(scene, seed=5).capture(sphere.pose(sphere.positions[1]), 2_000_000_000)
     found = create_estimator("geometric", model).estimate(view)
@@ -216,20 +215,27 @@ def test_seeds_are_told_apart_on_validation_scenes(banks, tmp_path, untrained, m
     assert rows[0]["training_minutes"] == 1.5
 
 
-def test_missing_seeds_are_trained(tmp_path, monkeypatch):
+def test_missing_seeds_are_trained(banks, tmp_path, monkeypatch):
+    from active6d_tools import policy_training
     from active6d_tools.cli import ablate
 
     asked = []
     monkeypatch.setattr(
-        "active6d_tools.cli.policy_training.policy",
-        lambda name, policy, steps, *, out, banks, seed: asked.append((policy, seed, out)),
+        ablate, "follow_training", lambda training, lookups, title: asked.append((training.folder, lookups, title))
     )
-    there = tmp_path / "mug" / "attention" / "seed1" / "best.safetensors"
+    folder = tmp_path / "mug"
+    there = folder / "attention" / "seed1" / policy_training.BEST
     there.parent.mkdir(parents=True)
     there.touch()
-    ablate._train_seeds("mug", tmp_path, 5, None)
-    assert asked[3:] == [("attention", seed, tmp_path / "mug" / "attention" / f"seed{seed}") for seed in (0, 2)]
-    assert len(asked) == 5
+    validation = BatchedFusion(load_bank(bank_path(banks, "mug", "val")))
+    found = ablate._train_seeds(validation, folder, 5, banks)
+    assert found["attention", 1] == there
+    every = [folder / name / f"seed{seed}" for name in ("view-attention", "attention") for seed in range(3)]
+    assert [path for path, _, _ in asked] == [path for path in every if path != there.parent]
+    assert asked[0][2] == "view-attention, mug, seed 0"
+    train, same = asked[0][1]
+    assert len(train.bank.scenes) == 2
+    assert same is validation
 
 
 @pytest.mark.parametrize(

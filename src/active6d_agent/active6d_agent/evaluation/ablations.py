@@ -1,6 +1,11 @@
-"""The paper's ablations on scene banks: what each part is worth, measured by leaving it out or turning it up."""
+"""The paper's ablations on scene banks: each part is left out or varied, and the policies are evaluated without it.
+
+Every ablation yields rows for a table: ``variant`` says what was varied, the other keys are those of
+:func:`~active6d_agent.evaluation.policy_evaluation.describe`.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +14,7 @@ from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import SceneBank
 from active6d_agent.environment.gym_environment import RewardParameters
 from active6d_agent.evaluation.policy_evaluation import Intervals, describe, run_named
+from active6d_agent.policies.attention.network import ATTENTION_RULES
 from active6d_agent.policies.attention.ppo import PpoParameters, train_ppo
 from active6d_core.metrics import score_errors
 from active6d_perception.scene.fusion import RANKINGS, FusionParameters
@@ -33,8 +39,8 @@ def ablate_steps(
     *,
     seed: int = 0,
     parameters: dict[str, dict] | None = None,
-) -> Iterator[tuple[str, int, dict]]:
-    """Policies with budgets from the single view to all views; yields name, T and what it achieved.
+) -> Iterator[dict]:
+    """Policies with budgets from the single view to all views; ``budget`` is T.
 
     Args:
         lookup: of the bank.
@@ -50,16 +56,16 @@ def ablate_steps(
             if budget < len(lookup.sphere):
                 own = (parameters or {}).get(name)
                 results = run_named(lookup, name, starts, budget, seed=seed, parameters=own)
-                yield name, budget, describe(results.measures, intervals)
+                yield {"variant": name, "budget": budget, **describe(results.measures, intervals)}
 
 
 def ablate_planning(
     lookup: BatchedFusion, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict | None = None
-) -> Iterator[tuple[str, float | None, dict]]:
+) -> Iterator[dict]:
     """``view-attention`` as it is, then with one parameter of :data:`PLANNING` set, then Random; nothing is trained.
 
-    Yields the parameter (or "as shipped", or "random"), its value (or None) and what it achieved, against the first;
-    ``moves`` is how many were taken.
+    ``parameter`` is the parameter's name, "as shipped" or "random", ``value`` its value or None, ``moves`` the mean
+    number of moves. Every row is compared with the first one.
 
     Args:
         lookup: of the bank.
@@ -77,14 +83,15 @@ def ablate_planning(
             changed = {**(parameters or {}), **({} if value is None else {name: value})}
             results = run_named(lookup, "view-attention", starts, steps, seed=seed, parameters=changed)
         measures = {**results.measures, "moves": (results.views >= 0).sum(axis=1) - 1.0}
-        yield name, value, describe(measures, intervals, first)
+        variant = name if value is None else f"{name} {value:g}"
+        yield {"variant": variant, "parameter": name, "value": value, **describe(measures, intervals, first)}
         first = first or measures
 
 
 def ablate_fusion(
     bank: SceneBank, policy: str, starts: np.ndarray, steps: int, *, seed: int = 0, scores: bool = False
-) -> Iterator[tuple[str, dict]]:
-    """The deployed fusion, and without one of its parts; yields the variant's name and what it achieved.
+) -> Iterator[dict]:
+    """The deployed fusion, and without one of its parts.
 
     The views are the same for all variants, those that ``policy`` takes with the deployed fusion, so that only fusion
     differs. ``detection_rate_at_n`` counts only as many hypotheses as there are objects, the best scored ones;
@@ -114,7 +121,7 @@ def ablate_fusion(
     intervals, first = Intervals(starts[:, 0], seed), None
     for name, lookup in variants:
         measures = _score_views(lookup, starts[:, 0], views)
-        yield name, describe(measures, intervals, first)
+        yield {"variant": name, **describe(measures, intervals, first)}
         first = first or measures
 
 
@@ -132,6 +139,27 @@ def _score_views(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) ->
     return {name: np.array(column) for name, column in columns.items()}
 
 
+def training_variants(
+    part: str, steps: int, total: int, seed: int
+) -> dict[str, tuple[PpoParameters, RewardParameters]]:
+    """What :func:`ablate_training` takes, for each of the ablations of the paper's training.
+
+    Args:
+        part: "alpha", the weight of getting closer in the reward; "attention", learned or by a rule; or "signs", the
+            reward's signs, turned round or as the paper prints them.
+        steps: moves T of an episode.
+        total: environment steps of each training.
+        seed: of the trainings.
+    """
+    parameters = PpoParameters(steps=steps, total=total, rollout=4 * steps, seed=seed)
+    if part == "alpha":
+        return {str(alpha): (parameters, RewardParameters(alpha=alpha)) for alpha in ALPHAS}
+    if part == "signs":
+        signs = {"turned round": False, "as printed": True}
+        return {name: (parameters, RewardParameters(as_printed=printed)) for name, printed in signs.items()}
+    return {rule: (replace(parameters, attend=rule), RewardParameters()) for rule in ATTENTION_RULES}
+
+
 def ablate_training(
     banks: dict[str, BatchedFusion],
     variants: dict[str, tuple[PpoParameters, RewardParameters]],
@@ -140,9 +168,8 @@ def ablate_training(
     *,
     seed: int = 0,
     on_progress: Callable[[str, int], None] = lambda name, steps: None,
-) -> Iterator[tuple[str, dict]]:
-    """Train the paper's policy in several variants and evaluate each; yields the variant's name and what it achieved,
-    against the first.
+) -> Iterator[dict]:
+    """Train the paper's policy in several variants and evaluate each; every row is compared with the first one.
 
     A training is known by what is varied, not by its name: one that an earlier call, perhaps of another ablation, has
     taken to the same length is not repeated.
@@ -163,5 +190,5 @@ def ablate_training(
             on_progress(name, progress.steps)
         weights = {"weights": str(own / "best.safetensors")}
         results = run_named(banks["test"], "attention", starts, parameters.steps, parameters=weights)
-        yield name, describe(results.measures, intervals, first)
+        yield {"variant": name, **describe(results.measures, intervals, first)}
         first = first or results.measures

@@ -1,7 +1,7 @@
-"""How much of the greedy oracle's lead is luck: the same views of the same scenes with other noise of the sensor.
+"""How much of the greedy oracle's lead is noise: the same views of the same scenes with other noise of the sensor.
 
 A bank holds one image per view, and the oracle chooses by what the estimator made of exactly that image. No planner can
-foresee the noise of an image that it has not taken, so what the oracle wins by it is nobody's to win.
+foresee the noise of an image that it has not taken, so no planner can win the part of the oracle's lead that is noise.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,14 +24,14 @@ def ablate_noise_resampling(
     *,
     seed: int = 0,
     parameters: dict[str, dict] | None = None,
-) -> Iterator[tuple[str, str, dict]]:
+) -> Iterator[dict]:
     """Policies choose their views on either bank; the views are scored on that bank and on the other one.
 
-    Yields the policy, the noise and what was achieved, the mean of both ways round. The noise is "own", that of the
-    images the views were chosen with; "other"; and for the oracle in between "unforeseen": it sees the truth and what
-    its own images gave so far, but weighs the next view by the other bank's image, and gets its own. Whatever is not
-    "own" is compared with it (``against_first``). ``gap_closed`` is the share of the way from Random's detection rate
-    to the oracle's on own noise.
+    Yields a row for each ``policy`` and ``noise``, the mean of both ways round. The noise is "own", that of the images
+    the views were chosen with; "other"; and for the oracle in between "unforeseen": it sees the truth and what its own
+    images gave so far, but weighs the next view by the other bank's image, and gets its own. Rows of other noise are
+    compared with the one of own noise (``against_first``). ``gap_closed`` is the share of the way from Random's
+    detection rate to the oracle's on own noise.
 
     Args:
         lookups: of two banks of the same scenes.
@@ -60,20 +60,22 @@ def ablate_noise_resampling(
     if high.mean() <= low.mean():
         raise ValueError("the oracle finds no more than Random from these starts; take more of them")
 
-    def tell(measures: dict[str, np.ndarray], first: dict[str, np.ndarray] | None = None) -> dict:
+    def row(name: str, noise: str, measures: dict, first: dict | None = None) -> dict:
         lead, gap = measures["detection_rate"] - low, high - low
         shares = {f"gap_closed_{kind}": ends for kind, ends in intervals.of_ratio(lead, gap).items()}
-        return {**describe(measures, intervals, first), "gap_closed": float(lead.mean() / gap.mean()), **shares}
+        gap_closed = {"gap_closed": float(lead.mean() / gap.mean()), **shares}
+        variant = {"variant": f"{name}, {noise} noise", "policy": name, "noise": noise}
+        return {**variant, **describe(measures, intervals, first), **gap_closed}
 
     for name in ("random", *(name for name in names if name not in ends), "oracle"):
         views = ends.get(name) or choose(name)
         own = score(views)
-        yield name, "own", tell(own)
+        yield row(name, "own", own)
         if name == "oracle":
             pairs = (lookups, lookups[::-1])
             unforeseen = [search_unforeseen(join_banks(*(each.bank for each in pair)), starts, steps) for pair in pairs]
-            yield name, "unforeseen", tell(score(unforeseen), own)
-        yield name, "other", tell(score(views, lookups[::-1]), own)
+            yield row(name, "unforeseen", score(unforeseen), own)
+        yield row(name, "other", score(views, lookups[::-1]), own)
 
 
 def _refuse_other_scenes(bank: SceneBank, other: SceneBank) -> None:
@@ -86,7 +88,7 @@ def _refuse_other_scenes(bank: SceneBank, other: SceneBank) -> None:
     if made(bank) != made(other):
         raise ValueError(
             f"the two banks of '{bank.object_name}' differ in more than their seed (scenes, estimator or factor on the "
-            "noise); make both anew with 'active6d bank'"
+            "noise); make both again with 'active6d bank'"
         )
 
 

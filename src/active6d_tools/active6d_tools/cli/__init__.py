@@ -10,20 +10,20 @@ from typer.exceptions import TyperException
 
 from active6d_tools.cli import (
     ablate,
-    agent_benchmark,
     bank,
     benchmark,
+    benchmark_agent,
+    benchmark_estimator,
     doctor,
     episode,
     estimate,
-    estimator_benchmark,
-    estimator_training,
     evaluate,
     objects,
-    policy_training,
     replay,
     report,
     scenes,
+    train_estimator,
+    train_policy,
 )
 
 
@@ -84,12 +84,12 @@ app.command()(evaluate.evaluate)
 app.command()(ablate.ablate)
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
-benchmark.app.command()(estimator_benchmark.estimator)
-benchmark.app.command()(agent_benchmark.environment)
-benchmark.app.command()(agent_benchmark.pipeline)
+benchmark.app.command()(benchmark_estimator.estimator)
+benchmark.app.command()(benchmark_agent.environment)
+benchmark.app.command()(benchmark_agent.pipeline)
 app.add_typer(benchmark.app, name="benchmark")
-estimator_training.app.command()(policy_training.policy)
-app.add_typer(estimator_training.app, name="train")
+train_estimator.app.command()(train_policy.policy)
+app.add_typer(train_estimator.app, name="train")
 
 
 def main() -> None:

@@ -1,18 +1,31 @@
-"""``active6d ablate PART``: the paper's figures, and what else a policy owes to its parts."""
+"""``active6d ablate PART``: the paper's ablations, and ablations of the default policy."""
 
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_tools.cli.bank import Banks
-from active6d_tools.cli.evaluate import Sample
-from active6d_tools.cli.output import JsonFile, ObjectName, Seed, console, messages, progress_bar, write_json
+from active6d_tools.cli.options import (
+    LEARNED,
+    Banks,
+    JsonFile,
+    ObjectName,
+    PolicyParameters,
+    Sample,
+    Seed,
+    parse_overrides,
+    usable_policies,
+)
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.progress import collect_rows, follow_training
+from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from active6d_agent.bank.batched_fusion import BatchedFusion
-    from active6d_tools.report.line_plots import Panel
 
 
 class Part(StrEnum):
@@ -34,69 +47,61 @@ _TRAINED = (Part.ALPHA, Part.ATTENTION, Part.SIGNS)
 _AGAIN = 1
 #: Trainings of each learned policy that ``seeds`` compares.
 _SEEDS = 3
-_OUT = "Folder of the trainings; the cache's."
+_OUT = "Folder of the trainings; by default in the cache folder."
+_POLICIES = "Policies that choose the views; verification and fusion use only the first one."
 
 
 def ablate(
     part: Annotated[Part, typer.Argument(help="What is varied or left out.")],
     object_name: ObjectName = "mug",
-    policies: Annotated[
-        str, typer.Option(help="Whose views; verification and fusion use the first one only.")
-    ] = "random,max-distance,unidirectional,lowest-score",
+    policies: Annotated[str, typer.Option(help=_POLICIES)] = "random,max-distance,unidirectional,lowest-score",
     steps: Annotated[int, typer.Option(min=1, help="Budget of moves T, where it is not varied.")] = 5,
     length: Annotated[
         int, typer.Option(min=1, help="Environment steps of each training (alpha, attention, signs).")
     ] = 200_000,
     sample: Sample = 200,
-    override: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="POLICY.NAME=VALUE", help="A policy's parameter; repeatable."),
-    ] = None,
+    override: PolicyParameters = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help=_OUT)] = None,
-    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the figure into this PNG.")] = None,
+    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the figure to this PNG file.")] = None,
     banks: Banks = None,
     seed: Seed = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure what a part is worth, as in the paper's figures.
+    """Vary one part of the method or leave it out, and evaluate the policies, as in the paper's figures.
 
-    alpha: the weight of getting closer in the reward. steps: the number of moves. attention: the learned one against
-    the lowest score. verification: its score against the estimator's. fusion: with clustering and without. signs: the
-    reward's, turned round and as the paper prints them. planning: what the default policy weighs, without training.
-    noise-resampling: the same views with other sensor noise, from a second bank (active6d bank --split test --seed 1).
-    seeds: three trainings of both learned policies, made where they are missing.
+    alpha: weight of getting closer in the reward. steps: number of moves. attention: learned attention against the
+    lowest score. verification: ranking by verification score against the estimator's score. fusion: with clustering
+    and without. signs: signs of the reward, reversed and as the paper prints them. planning: parameters of the
+    default policy, without training. noise-resampling: the same views with other sensor noise, from a second bank
+    (active6d bank --split test --seed 1). seeds: three trainings of both learned policies; missing ones are trained.
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """
     from active6d_agent.bank.batched_fusion import BatchedFusion
     from active6d_agent.bank.scene_bank import load_bank
     from active6d_agent.evaluation.policy_evaluation import all_starts
-    from active6d_tools.cli.episode import parse_overrides
+    from active6d_agent.evaluation.training_seeds import compare_seeds, mark_best
+    from active6d_tools.report.ablation_plots import ablation_panels
     from active6d_tools.report.line_plots import draw_panels
 
     paths = _find_banks(part, object_name, banks)
     parameters = parse_overrides(override or [])
-    if part is Part.SEEDS:
-        weights = _train_seeds(object_name, out, steps, banks)
     with messages.status("reading the banks"):
         lookups = {split: BatchedFusion(load_bank(path)) for split, path in paths.items()}
     starts = all_starts(lookups["test"], sample, seed)
     names = [name.strip() for name in policies.split(",")]
     if part in _TRAINED:
-        rows = _train_variants(part, lookups, _folder(out, object_name), steps, length, starts, seed)
-    elif part is Part.STEPS:
-        rows = _vary_steps(lookups["test"], names, starts, seed, parameters)
-    elif part is Part.PLANNING:
-        rows = _vary_planning(lookups["test"], starts, steps, seed, parameters)
-    elif part is Part.NOISE_RESAMPLING:
-        rows = _try_other_noise(lookups["test"], lookups["again"], names, starts, steps, seed, parameters)
+        rows = _train_variants(part, lookups, _folder(out, "ablations", object_name), steps, length, starts, seed)
     elif part is Part.SEEDS:
-        rows = _compare_seeds(lookups, weights, starts, steps, sample, seed)
+        weights = _train_seeds(lookups["val"], _folder(out, "policies", object_name), steps, banks)
+        made = compare_seeds(lookups["val"], lookups["test"], weights, starts, steps, sample=sample, seed=seed)
+        rows = collect_rows(made, len(weights), "evaluating")
+        mark_best(rows)
     else:
-        rows = _vary_fusion(part, lookups["test"], names[0], starts, steps, seed)
+        rows = _evaluate_variants(part, lookups, names, starts, steps, seed, parameters)
     _print(rows, f"{part.value}, {object_name}, {len(starts)} episodes")
     if png is not None:
-        draw_panels(png, f"{part.value}, {object_name}", _panels(part, rows))
+        draw_panels(png, f"{part.value}, {object_name}", ablation_panels(part.value, rows))
         messages.print(f"wrote {png}", highlight=False)
     common = {"object": object_name, "part": part.value, "steps": steps, "episodes": len(starts), "seed": seed}
     write_json(json_file, {**common, "bank": lookups["test"].bank.provenance, "rows": rows})
@@ -111,162 +116,83 @@ def _find_banks(part: Part, object_name: str, folder: Path | None) -> dict[str, 
     return paths | ({"again": find_bank(object_name, "test", folder, _AGAIN)} if part is Part.NOISE_RESAMPLING else {})
 
 
-def _folder(out: Path | None, object_name: str) -> Path:
-    from active6d_agent.bank.scene_bank import cached_banks
+def _folder(out: Path | None, kind: str, object_name: str) -> Path:
+    from active6d_core.files import cache_folder
 
-    return (out or cached_banks().parent / "ablations") / object_name
+    return (out or cache_folder(kind)) / object_name
 
 
 def _train_variants(
-    part: Part, lookups: dict[str, "BatchedFusion"], folder: Path, steps: int, length: int, starts: Any, seed: int
+    part: Part,
+    lookups: dict[str, "BatchedFusion"],
+    folder: Path,
+    steps: int,
+    length: int,
+    starts: "np.ndarray",
+    seed: int,
 ) -> list[dict]:
-    from active6d_agent.environment.gym_environment import RewardParameters
-    from active6d_agent.evaluation.ablations import ALPHAS, ablate_training
-    from active6d_agent.policies.attention.network import ATTENTION_RULES
-    from active6d_agent.policies.attention.ppo import PpoParameters
+    from active6d_agent.evaluation.ablations import ablate_training, training_variants
 
-    common = {"steps": steps, "total": length, "rollout": 4 * steps, "seed": seed}
-    if part is Part.ALPHA:
-        variants = {str(alpha): (PpoParameters(**common), RewardParameters(alpha=alpha)) for alpha in ALPHAS}
-    elif part is Part.SIGNS:
-        signs = {"turned round": RewardParameters(), "as printed": RewardParameters(as_printed=True)}
-        variants = {name: (PpoParameters(**common), reward) for name, reward in signs.items()}
-    else:
-        variants = {rule: (PpoParameters(**common, attend=rule), RewardParameters()) for rule in ATTENTION_RULES}
+    variants = training_variants(part.value, steps, length, seed)
+    before = {name: length * index for index, name in enumerate(variants)}
     with progress_bar() as bar:
-        order = {name: length * index for index, name in enumerate(variants)}
         task = bar.add_task("training", total=length * len(variants))
-        made = ablate_training(
-            lookups,
-            variants,
-            folder,
-            starts,
-            seed=seed,
-            on_progress=lambda name, done: bar.update(task, description=name, completed=order[name] + done),
-        )
-        return [{"variant": name, **row} for name, row in made]
+
+        def on_progress(name: str, done: int) -> None:
+            bar.update(task, description=name, completed=before[name] + done)
+
+        return list(ablate_training(lookups, variants, folder, starts, seed=seed, on_progress=on_progress))
 
 
-def _vary_steps(
-    lookup: "BatchedFusion", names: list[str], starts: Any, seed: int, parameters: dict[str, dict]
-) -> list[dict]:
-    from active6d_agent.evaluation.ablations import STEPS, ablate_steps
-    from active6d_tools.cli.evaluate import usable_policies
-
-    usable_policies(",".join(names), lookup.bank, parameters)
-    rows = []
-    with progress_bar() as bar:
-        task = bar.add_task("moving", total=len(names) * sum(STEPS))
-        for name, budget, row in ablate_steps(lookup, names, starts, STEPS, seed=seed, parameters=parameters):
-            rows.append({"variant": name, "budget": budget, **row})
-            bar.update(task, advance=budget, description=f"{name}, T = {budget}")
-    return rows
-
-
-def _vary_planning(
-    lookup: "BatchedFusion", starts: Any, steps: int, seed: int, parameters: dict[str, dict]
-) -> list[dict]:
-    from active6d_agent.evaluation.ablations import PLANNING, ablate_planning
-    from active6d_tools.cli.evaluate import usable_policies
-
-    usable_policies("view-attention", lookup.bank, parameters)
-    rows = []
-    with progress_bar() as bar:
-        task = bar.add_task("planning", total=2 + sum(map(len, PLANNING.values())))
-        own = parameters.get("view-attention")
-        for name, value, row in ablate_planning(lookup, starts, steps, seed=seed, parameters=own):
-            variant = name if value is None else f"{name} {value:g}"
-            rows.append({"variant": variant, "parameter": name, "value": value, **row})
-            bar.update(task, advance=1, description=variant)
-    return rows
-
-
-def _try_other_noise(
-    lookup: "BatchedFusion",
-    again: "BatchedFusion",
+def _evaluate_variants(
+    part: Part,
+    lookups: dict[str, "BatchedFusion"],
     names: list[str],
-    starts: Any,
+    starts: "np.ndarray",
     steps: int,
     seed: int,
     parameters: dict[str, dict],
 ) -> list[dict]:
+    """The ablations without training."""
+    from active6d_agent.evaluation.ablations import PLANNING, STEPS, ablate_fusion, ablate_planning, ablate_steps
     from active6d_agent.evaluation.noise_resampling import ablate_noise_resampling
-    from active6d_tools.cli.evaluate import usable_policies
 
-    usable_policies(",".join(names), lookup.bank, parameters)
-    rows = []
-    with progress_bar() as bar:
-        task = bar.add_task("noise-resampling", total=len({*names, "random", "oracle"}))
-        for name, noise, row in ablate_noise_resampling(
-            (lookup, again), names, starts, steps, seed=seed, parameters=parameters
-        ):
-            rows.append({"variant": f"{name}, {noise} noise", "policy": name, "noise": noise, **row})
-            bar.update(task, completed=len({row["policy"] for row in rows}), description=rows[-1]["variant"])
-    return rows
-
-
-def _train_seeds(object_name: str, out: Path | None, steps: int, banks: Path | None) -> dict[tuple[str, int], Path]:
-    """Weights of every learned policy and seed; trains, as ``active6d train policy`` does, those that are not there."""
-    from active6d_agent.bank.scene_bank import cached_banks
-    from active6d_tools.cli.policy_training import LEARNED, policy
-
-    folder = (out or cached_banks().parent / "policies") / object_name
-    found = {(name, seed): folder / name / f"seed{seed}" for name in LEARNED for seed in range(_SEEDS)}
-    for (name, seed), own in found.items():
-        if not (own / "best.safetensors").is_file():
-            policy(object_name, name, steps, out=own, banks=banks, seed=seed)
-    return {key: own / "best.safetensors" for key, own in found.items()}
+    test, common = lookups["test"], {"seed": seed}
+    rows: Iterator[dict]
+    if part in (Part.FUSION, Part.VERIFICATION):
+        rows = ablate_fusion(test.bank, names[0], starts, steps, scores=part is Part.VERIFICATION, **common)
+        return collect_rows(rows, 3, f"fusing the views of {names[0]}")
+    if part is Part.PLANNING:
+        usable_policies("view-attention", test.bank, parameters)
+        rows = ablate_planning(test, starts, steps, parameters=parameters.get("view-attention"), **common)
+        return collect_rows(rows, 2 + sum(map(len, PLANNING.values())), "planning")
+    usable_policies(",".join(names), test.bank, parameters)
+    if part is Part.STEPS:
+        rows = ablate_steps(test, names, starts, STEPS, parameters=parameters, **common)
+        return collect_rows(rows, len(names) * sum(STEPS), "moving")
+    rows = ablate_noise_resampling((test, lookups["again"]), names, starts, steps, parameters=parameters, **common)
+    return collect_rows(rows, 2 * len({*names, "random", "oracle"}) + 1, "resampling the noise")
 
 
-def _compare_seeds(
-    lookups: dict[str, "BatchedFusion"],
-    weights: dict[tuple[str, int], Path],
-    starts: Any,
-    steps: int,
-    sample: int | None,
-    seed: int,
-) -> list[dict]:
-    """Test figures of every training, its minutes, and which one is best on the same validation starts."""
-    import json
+def _train_seeds(
+    validation: "BatchedFusion", folder: Path, steps: int, banks: Path | None
+) -> dict[tuple[str, int], Path]:
+    """Weights of every learned policy and seed; missing ones are trained as by ``active6d train policy``."""
+    from active6d_agent.bank.batched_fusion import BatchedFusion
+    from active6d_agent.bank.scene_bank import find_bank, load_bank
+    from active6d_tools.policy_training import plan_training
 
-    from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, describe, run_named
-    from active6d_agent.policies.registry import weights_path
-
-    validation, intervals, rows = all_starts(lookups["val"], sample, seed), Intervals(starts[:, 0], seed), []
-    with progress_bar() as bar:
-        for (name, number), path in bar.track(weights.items(), description="evaluating"):
-            own = {"weights": str(path)}
-            chosen_on = run_named(lookups["val"], name, validation, steps, parameters=own)
-            results = run_named(lookups["test"], name, starts, steps, parameters=own)
-            shipped = weights_path(name, lookups["test"].model.name)
-            curve = (path.parent / "curve.jsonl").read_text().splitlines()
-            rows.append(
-                {
-                    "variant": f"{name}, seed {number}",
-                    "policy": name,
-                    "training_seed": number,
-                    "training_minutes": json.loads(curve[-1])["seconds"] / 60,
-                    "validation_detection_rate": float(chosen_on.detection_rate.mean()),
-                    "validation_e_add_mm": float(chosen_on.e_add_mm.mean()),
-                    "shipped": shipped.is_file() and shipped.read_bytes() == path.read_bytes(),
-                    **describe(results.measures, intervals),
-                }
-            )
-    for name in dict.fromkeys(row["policy"] for row in rows):
-        own = [row for row in rows if row["policy"] == name]
-        best = max(own, key=lambda row: (row["validation_detection_rate"], -row["validation_e_add_mm"]))
-        for row in own:
-            row["best_on_validation"] = row is best
-    return rows
-
-
-def _vary_fusion(part: Part, lookup: "BatchedFusion", name: str, starts: Any, steps: int, seed: int) -> list[dict]:
-    from active6d_agent.evaluation.ablations import ablate_fusion
-
-    scores = part is Part.VERIFICATION
-    with messages.status(f"fusing the views of {name}"):
-        made = ablate_fusion(lookup.bank, name, starts, steps, seed=seed, scores=scores)
-        return [{"variant": variant, **row} for variant, row in made]
+    trainings = {
+        (name, seed): plan_training(name, folder / name / f"seed{seed}", steps=steps, seed=seed)
+        for name in LEARNED
+        for seed in range(_SEEDS)
+    }
+    missing = {key: training for key, training in trainings.items() if not training.best.is_file()}
+    if missing:
+        train = BatchedFusion(load_bank(find_bank(validation.model.name, "train", banks)))
+        for (name, seed), training in missing.items():
+            follow_training(training, [train, validation], f"{name}, {validation.model.name}, seed {seed}")
+    return {key: training.best for key, training in trainings.items()}
 
 
 def _print(rows: list[dict], title: str) -> None:
@@ -280,50 +206,3 @@ def _print(rows: list[dict], title: str) -> None:
     for row in rows:
         table.add_row(*(f"{row[key]:.3f}" if isinstance(row[key], float) else str(row[key]) for key in columns))
     console.print(table)
-
-
-def _panels(part: Part, rows: list[dict]) -> list["Panel"]:
-    """Detection rate and e_ADD, and a third measure, over what is varied; around them the interval over scenes."""
-    from active6d_tools.report.line_plots import Panel
-
-    if part is Part.PLANNING:
-        return _trade_offs(rows)
-    reported = ("reported", "hypotheses an object")
-    share = ("gap_closed", "share of the gap on own noise")
-    third = {Part.FUSION: reported, Part.VERIFICATION: reported, Part.NOISE_RESAMPLING: share}.get(
-        part, ("distance_m", "d [m]")
-    )
-    line, x, x_label = {
-        Part.STEPS: ("variant", "budget", "T"),
-        Part.SEEDS: ("policy", "training_seed", "seed of the training"),
-        Part.NOISE_RESAMPLING: ("noise", "policy", "views chosen by"),
-    }.get(part, (None, "variant", part.value))
-    panels = []
-    for key, label in (("detection_rate", "detection rate"), ("e_add_mm", "e_ADD [mm]"), third):
-        lines: dict[str, tuple] = {}
-        for name in dict.fromkeys(row.get(line, label) for row in rows):
-            own = [row for row in rows if row.get(line, label) == name]
-            interval = list(zip(*(row[f"{key}_ci95_scenes"] for row in own), strict=True))
-            # As text, so that few views have as much room as many.
-            lines[name] = ([str(row[x]) for row in own], [row[key] for row in own], interval)
-        panels.append(Panel(x_label, label, lines))
-    return panels
-
-
-def _trade_offs(rows: list[dict]) -> list["Panel"]:
-    """What metres and moves buy."""
-    from active6d_tools.report.line_plots import Panel
-
-    panels = []
-    everything = ("metres_weight", "stop_below", "as shipped", "random")
-    for x, x_label, y, y_label, names in (
-        ("distance_m", "d [m]", "detection_rate", "detection rate", everything),
-        ("distance_m", "d [m]", "e_add_mm", "e_ADD [mm]", everything),
-        ("moves", "moves taken", "detection_rate", "detection rate", everything[1:]),
-    ):
-        lines = {}
-        for name in names:
-            own = [row for row in rows if row["parameter"] == name]
-            lines[name] = ([row[x] for row in own], [row[y] for row in own])
-        panels.append(Panel(x_label, y_label, lines))
-    return panels

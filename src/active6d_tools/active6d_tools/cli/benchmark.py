@@ -4,7 +4,9 @@ from typing import Annotated
 
 import typer
 
-from active6d_tools.cli.output import JsonFile, ObjectName, Seed, console, progress_bar, write_json
+from active6d_tools.cli.options import JsonFile, ObjectName, Seed
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, progress_bar
 
 app = typer.Typer(help="Measure speed and quality.", rich_markup_mode="rich")
 

@@ -4,7 +4,9 @@ from dataclasses import asdict
 
 import typer
 
-from active6d_tools.cli.output import JsonFile, console, messages, write_json
+from active6d_tools.cli.options import JsonFile
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, messages
 
 
 def doctor(json_file: JsonFile = None) -> None:

@@ -5,18 +5,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from active6d_tools.cli.output import (
+from active6d_tools.cli.options import (
     JsonFile,
+    NodeParameters,
     ObjectName,
-    Overrides,
     ParamsFile,
     Processes,
     Seed,
-    console,
-    messages,
-    progress_bar,
-    write_json,
+    parse_overrides,
 )
+from active6d_tools.cli.output import write_json, write_reports
+from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
     from active6d_bringup.graph.episode import EpisodeResult, EpisodeSettings, EpisodeStep
@@ -45,7 +44,7 @@ def episode(
     ] = None,
     processes: Processes = False,
     params_file: ParamsFile = None,
-    override: Overrides = None,
+    override: NodeParameters = None,
     json_file: JsonFile = None,
 ) -> None:
     """Let the graph look at a heap, think and move, once: the same seed gives the same episode.
@@ -77,32 +76,10 @@ def episode(
     _print_summary(result, summary)
     if report is not None or figure is not None:
         from active6d_bringup.bags.reader import read_episode
-        from active6d_tools.cli.report import write_reports
         from active6d_tools.report.analysis import analyse
 
         write_reports(analyse(read_episode(bag)), report, figure=figure)
     write_json(json_file, summary)
-
-
-def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
-    """``node.parameter=value`` texts to node, parameter and value, read as YAML like ROS does.
-
-    Raises:
-        ValueError: a text that is not of that form.
-    """
-    import yaml
-
-    overrides: dict[str, dict[str, Any]] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        node, dot, parameter = name.partition(".")
-        if not (equals and dot and node and parameter):
-            raise ValueError(f"--set {text}: expected NODE.NAME=VALUE, such as hypothesis_fusion.epsilon=0.01")
-        try:
-            overrides.setdefault(node, {})[parameter] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise ValueError(f"--set {text}: the value is not YAML ({error})") from error
-    return overrides
 
 
 def _check_names(settings: "EpisodeSettings") -> None:

@@ -5,7 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_tools.cli.output import JsonFile, ObjectName, console, messages, progress_bar, write_file, write_json
+from active6d_core.files import write_file
+from active6d_tools.cli.options import JsonFile, ObjectName
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
     from PIL.Image import Image

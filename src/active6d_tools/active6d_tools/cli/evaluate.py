@@ -4,21 +4,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from active6d_tools.cli.bank import Banks
-from active6d_tools.cli.output import JsonFile, ObjectName, Seed, console, messages, progress_bar, write_json
+from active6d_tools.cli.options import (
+    Banks,
+    JsonFile,
+    ObjectName,
+    PolicyParameters,
+    Sample,
+    Seed,
+    parse_overrides,
+    usable_policies,
+)
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-#: In the table's order.
-ALL_POLICIES = (
-    *("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score", "attention"),
-    *("view-attention", "oracle", "all-views"),
-)
 #: What the others are compared with in a table of its own.
 _DEFAULT = "view-attention"
 Policies = Annotated[str, typer.Option(help="Names separated by commas, or all; oracle and all-views are bounds.")]
-Sample = Annotated[int | None, typer.Option(min=1, help="That many starts, drawn by --seed; all of them by default.")]
 
 
 def evaluate(
@@ -27,9 +31,7 @@ def evaluate(
     steps: Annotated[int, typer.Option(min=1, help="Budget of moves T; T moves are T + 1 views.")] = 5,
     split: Annotated[str, typer.Option(help="Which bank: train, val or test.")] = "test",
     sample: Sample = None,
-    override: Annotated[
-        list[str] | None, typer.Option("--set", metavar="POLICY.NAME=VALUE", help="A policy's parameter; repeatable.")
-    ] = None,
+    override: PolicyParameters = None,
     banks: Banks = None,
     seed: Seed = 0,
     json_file: JsonFile = None,
@@ -43,7 +45,6 @@ def evaluate(
     from active6d_agent.evaluation.policy_evaluation import all_starts, summarise
     from active6d_agent.evaluation.policy_evaluation import evaluate as run_all
     from active6d_sim.scenes.scene_store import SPLITS
-    from active6d_tools.cli.episode import parse_overrides
 
     if split not in SPLITS:
         raise ValueError(f"--split '{split}' is not among {', '.join(SPLITS)}")
@@ -69,34 +70,6 @@ def evaluate(
         console.print(_differences(summary))
     provenance = {"split": split, "seed": seed, "bank": bank.provenance, "parameters": parameters}
     write_json(json_file, {**summary, **provenance})
-
-
-def usable_policies(text: str, bank: Any, parameters: dict[str, dict]) -> list[str]:
-    """Names out of a comma-separated list; ``all`` leaves out, with a note, policies whose weights are missing.
-
-    Raises:
-        ValueError: an unknown name, a wrong parameter, or a policy asked for by name that has no weights.
-    """
-    from active6d_agent.evaluation.policy_evaluation import BOUNDS
-    from active6d_agent.policies.registry import create_policy
-
-    names = list(ALL_POLICIES) if text == "all" else [name.strip() for name in text.split(",")]
-    usable = []
-    for name in names:
-        try:
-            if name not in BOUNDS:
-                own = {"entropy": bank.scenes[0].entropy} if name == "entropy" else {}
-                create_policy(name, bank.model, **{**own, **parameters.get(name, {})})
-        except ValueError as error:
-            if text != "all" or name in parameters:
-                raise
-            messages.print(f"left out: {error}", highlight=False, markup=False)
-            continue
-        usable.append(name)
-    unknown = sorted(parameters.keys() - set(usable))
-    if unknown:
-        raise ValueError(f"--set {unknown[0]}: no such policy among {', '.join(usable)}")
-    return usable
 
 
 def _table(summary: dict[str, Any]) -> "Table":

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from active6d_core.files import write_file
-from active6d_tools.cli.output import JsonFile, console, messages, write_json
+from active6d_tools.cli.options import JsonFile
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, messages
 
 if TYPE_CHECKING:
     from active6d_core.object_model import ObjectModel

@@ -1,46 +1,18 @@
-"""What the subcommands share: the terminal, progress with time left, options, JSON with the versions that made it."""
+"""Files that several subcommands write: JSON with the versions of what made it, weights, reports."""
 
 import json
 import platform
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from typing import TYPE_CHECKING, Any
 
 from active6d_core.files import write_file
+from active6d_tools.cli.terminal import messages
 
-console = Console()
-#: Progress and notes, so that standard output holds results only.
-messages = Console(stderr=True)
-
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was measured to this file.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
-ObjectName = Annotated[str, typer.Option("--object", help="Object to work on, see `active6d object list`.")]
-BagFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a recorded bag.")]
-BagObject = Annotated[str | None, typer.Option("--object", help="The object, where the bag does not name it.")]
-Processes = Annotated[bool, typer.Option("--processes", help="Run every node in a process of its own.")]
-ParamsFile = Annotated[Path | None, typer.Option(metavar="FILE", help="ROS parameters of all nodes.")]
-Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="NODE.NAME=VALUE", help="A parameter of a node; repeatable.")
-]
+if TYPE_CHECKING:
+    from active6d_tools.report.analysis import EpisodeAnalysis
 
 _VERSIONS = ("numpy", "scipy", "open3d", "pybullet", "torch", "rclpy")
-
-
-def progress_bar() -> Progress:
-    """A progress bar on standard error with a description, counts, elapsed time and time left."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(compact=True),
-        console=messages,
-    )
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
@@ -75,3 +47,22 @@ def _installed_versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return versions
+
+
+def write_reports(
+    analysis: "EpisodeAnalysis", html: Path | None = None, png: Path | None = None, figure: Path | None = None
+) -> None:
+    """Write what has a path: the HTML page, the picture of all views, the figure of before, after and attention.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    from active6d_tools.report.figure import render_png
+    from active6d_tools.report.page import render_html
+    from active6d_tools.report.qualitative import render_qualitative
+
+    for path, render in ((html, render_html), (png, render_png), (figure, render_qualitative)):
+        if path is not None:
+            with messages.status(f"drawing {path.name}"):
+                write_file(path, render(analysis))
+            messages.print(f"wrote {path}", highlight=False, markup=False)

@@ -4,18 +4,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_tools.cli.episode import parse_overrides
-from active6d_tools.cli.output import (
+from active6d_tools.cli.options import (
     BagFolder,
     BagObject,
     JsonFile,
-    Overrides,
+    NodeParameters,
     ParamsFile,
     Processes,
-    console,
-    progress_bar,
-    write_json,
+    parse_overrides,
 )
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, progress_bar
 
 if TYPE_CHECKING:
     from active6d_bringup.bags.replay import ReplayResult, ReplaySettings
@@ -34,7 +33,7 @@ def replay(
     estimator: Annotated[str | None, typer.Option(help="Another estimator than the recorded one.")] = None,
     processes: Processes = False,
     params_file: ParamsFile = None,
-    override: Overrides = None,
+    override: NodeParameters = None,
     json_file: JsonFile = None,
 ) -> None:
     """Send a bag's camera through live perception.

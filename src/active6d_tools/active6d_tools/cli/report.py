@@ -5,15 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_core.files import write_file
-from active6d_tools.cli.output import (
-    BagFolder,
-    BagObject,
-    JsonFile,
-    console,
-    messages,
-    write_json,
-)
+from active6d_tools.cli.options import BagFolder, BagObject, JsonFile
+from active6d_tools.cli.output import write_json, write_reports
+from active6d_tools.cli.terminal import console, messages
 
 if TYPE_CHECKING:
     from active6d_tools.report.analysis import EpisodeAnalysis
@@ -49,25 +43,6 @@ def report(
     write_reports(analysis, output or folder / "report.html", png, figure)
     print_summary(analysis)
     write_json(json_file, analysis.summary())
-
-
-def write_reports(
-    analysis: "EpisodeAnalysis", html: Path | None = None, png: Path | None = None, figure: Path | None = None
-) -> None:
-    """Write what has a path: the HTML page, the picture of all views, the figure of before, after and attention.
-
-    Raises:
-        OSError: a file cannot be written.
-    """
-    from active6d_tools.report.figure import render_png
-    from active6d_tools.report.page import render_html
-    from active6d_tools.report.qualitative import render_qualitative
-
-    for path, render in ((html, render_html), (png, render_png), (figure, render_qualitative)):
-        if path is not None:
-            with messages.status(f"drawing {path.name}"):
-                write_file(path, render(analysis))
-            messages.print(f"wrote {path}", highlight=False, markup=False)
 
 
 def print_summary(analysis: "EpisodeAnalysis") -> None:

@@ -6,15 +6,9 @@ from typing import Annotated
 import typer
 
 from active6d_core.files import write_file
-from active6d_tools.cli.output import (
-    JsonFile,
-    ObjectName,
-    Seed,
-    console,
-    messages,
-    progress_bar,
-    write_json,
-)
+from active6d_tools.cli.options import JsonFile, ObjectName, Seed
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, messages, progress_bar
 
 app = typer.Typer(help="Stored scenes: generate, report, show.", rich_markup_mode="rich")
 

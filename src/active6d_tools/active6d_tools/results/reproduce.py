@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from active6d_core.files import write_file
-from active6d_tools.cli.output import messages, progress_bar
+from active6d_tools.cli.terminal import messages, progress_bar
 from active6d_tools.results.page import JOBS, OBJECTS, Job, fill, read_reports
 
 ROOT = Path(__file__).parents[4]

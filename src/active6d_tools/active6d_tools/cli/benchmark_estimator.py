@@ -7,7 +7,9 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from active6d_tools.cli.output import JsonFile, ObjectName, Seed, console, messages, progress_bar, write_json
+from active6d_tools.cli.options import JsonFile, ObjectName, Seed
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, messages, progress_bar
 
 
 def estimator(

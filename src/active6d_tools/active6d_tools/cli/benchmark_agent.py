@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from active6d_tools.cli.bank import Banks
-from active6d_tools.cli.output import JsonFile, ObjectName, Seed, console, messages, progress_bar, write_json
+from active6d_tools.cli.options import Banks, JsonFile, ObjectName, Seed
+from active6d_tools.cli.output import write_json
+from active6d_tools.cli.terminal import console, messages, progress_bar
 
 
 def environment(

@@ -1,0 +1,91 @@
+"""Options that several subcommands have, and how their texts are read."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from active6d_tools.cli.terminal import messages
+
+if TYPE_CHECKING:
+    from active6d_agent.bank.scene_bank import SceneBank
+
+JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results to this JSON file.")]
+Seed = Annotated[int, typer.Option(help="Seed of the random generators.", min=0)]
+ObjectName = Annotated[str, typer.Option("--object", help="Name of the object, see `active6d object list`.")]
+BagFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a recorded bag.")]
+BagObject = Annotated[str | None, typer.Option("--object", help="Name of the object, if the bag does not contain it.")]
+Processes = Annotated[bool, typer.Option("--processes", help="Run every node in its own process.")]
+ParamsFile = Annotated[Path | None, typer.Option(metavar="FILE", help="YAML file with ROS parameters of the nodes.")]
+NodeParameters = Annotated[
+    list[str] | None, typer.Option("--set", metavar="NODE.NAME=VALUE", help="Set a parameter of a node; repeatable.")
+]
+PolicyParameters = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="POLICY.NAME=VALUE", help="Set a parameter of a policy; repeatable."),
+]
+Banks = Annotated[
+    Path | None,
+    typer.Option("--banks", metavar="DIR", help="Folder of the banks; by default active6d/banks in the cache folder."),
+]
+Sample = Annotated[
+    int | None, typer.Option(min=1, help="Number of starts, sampled with --seed; by default all of them.")
+]
+
+#: In the order of the table that ``active6d evaluate`` prints.
+ALL_POLICIES = (
+    *("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score", "attention"),
+    *("view-attention", "oracle", "all-views"),
+)
+
+#: Policies that ``active6d train policy`` trains.
+LEARNED = ("view-attention", "attention")
+
+
+def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
+    """``node.parameter=value`` texts to node, parameter and value, which is read as YAML as in ROS.
+
+    Raises:
+        ValueError: a text that is not of that form.
+    """
+    import yaml
+
+    overrides: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        node, dot, parameter = name.partition(".")
+        if not (equals and dot and node and parameter):
+            raise ValueError(f"--set {text}: expected NODE.NAME=VALUE, such as hypothesis_fusion.epsilon=0.01")
+        try:
+            overrides.setdefault(node, {})[parameter] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ValueError(f"--set {text}: the value is not YAML ({error})") from error
+    return overrides
+
+
+def usable_policies(text: str, bank: "SceneBank", parameters: dict[str, dict]) -> list[str]:
+    """Names out of a comma-separated list; ``all`` leaves out, with a note, policies whose weights are missing.
+
+    Raises:
+        ValueError: an unknown name, a wrong parameter, or a policy asked for by name that has no weights.
+    """
+    from active6d_agent.evaluation.policy_evaluation import BOUNDS
+    from active6d_agent.policies.registry import create_policy
+
+    names = list(ALL_POLICIES) if text == "all" else [name.strip() for name in text.split(",")]
+    usable = []
+    for name in names:
+        try:
+            if name not in BOUNDS:
+                own = {"entropy": bank.scenes[0].entropy} if name == "entropy" else {}
+                create_policy(name, bank.model, **{**own, **parameters.get(name, {})})
+        except ValueError as error:
+            if text != "all" or name in parameters:
+                raise
+            messages.print(f"left out: {error}", highlight=False, markup=False)
+            continue
+        usable.append(name)
+    unknown = sorted(parameters.keys() - set(usable))
+    if unknown:
+        raise ValueError(f"--set {unknown[0]}: no such policy among {', '.join(usable)}")
+    return usable

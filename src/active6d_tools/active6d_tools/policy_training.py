@@ -1,0 +1,121 @@
+"""Training of learned policies: parameters from a command line, and curves that are drawn during training."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from active6d_agent.bank.batched_fusion import BatchedFusion
+
+#: Weights of the checkpoint with the best validation result, in the folder of a training.
+BEST = "best.safetensors"
+
+
+@dataclass(frozen=True)
+class PolicyTraining:
+    """A training that is ready to start.
+
+    Attributes:
+        folder: of its checkpoints and curve.
+        total: number of rounds or environment steps.
+        start: look-ups of the train and validation banks to the progress of the training.
+    """
+
+    folder: Path
+    total: int
+    start: Callable[[BatchedFusion, BatchedFusion], Iterator[Any]]
+
+    @property
+    def best(self) -> Path:
+        """The weights with the best validation result."""
+        return self.folder / BEST
+
+    def curve(self) -> list[dict]:
+        """The validation results so far."""
+        return [json.loads(line) for line in (self.folder / "curve.jsonl").read_text().splitlines()]
+
+
+def plan_training(
+    policy: str,
+    folder: Path,
+    *,
+    steps: int,
+    seed: int = 0,
+    length: int | None = None,
+    groups: dict[str, dict] | None = None,
+    resume: bool = False,
+) -> PolicyTraining:
+    """A training of "view-attention" (DAgger) or "attention" (PPO); nothing starts yet.
+
+    Args:
+        policy: to train.
+        folder: of the training.
+        steps: horizon T.
+        seed: of the training.
+        length: number of rounds of DAgger or of environment steps of PPO; None for the default.
+        groups: parameters by group: training, weighing (view-attention) and reward (attention).
+        resume: continue the training in that folder.
+
+    Raises:
+        ValueError: an unknown group or parameter, or a value out of range.
+    """
+    plan = _plan_dagger if policy == "view-attention" else _plan_ppo
+    return plan(folder, {"steps": steps, "seed": seed}, length, groups or {}, resume)
+
+
+def _plan_dagger(folder: Path, common: dict, length: int | None, groups: dict, resume: bool) -> PolicyTraining:
+    from active6d_agent.policies.view_attention.dagger import DaggerParameters, train_dagger
+    from active6d_agent.policies.view_attention.network import Weighing
+
+    own = {"rounds": length} if length else {}
+    parameters = _make(DaggerParameters, "training", {**common, **own}, groups)
+    weighing = _make(Weighing, "weighing", {}, groups)
+    _refuse_others(groups, ("training", "weighing"))
+    return PolicyTraining(
+        folder,
+        parameters.rounds,
+        lambda train, val: train_dagger(train, val, folder, parameters, weighing, resume=resume),
+    )
+
+
+def _plan_ppo(folder: Path, common: dict, length: int | None, groups: dict, resume: bool) -> PolicyTraining:
+    from active6d_agent.environment.gym_environment import RewardParameters
+    from active6d_agent.policies.attention.ppo import PpoParameters, train_ppo
+
+    own = {"total": length} if length else {}
+    training = groups.get("training", {})
+    # The rollout must be a multiple of the horizon.
+    if "rollout" not in training:
+        own["rollout"] = 4 * training.get("steps", common["steps"])
+    parameters = _make(PpoParameters, "training", {**common, **own}, groups)
+    reward = _make(RewardParameters, "reward", {}, groups)
+    _refuse_others(groups, ("training", "reward"))
+    return PolicyTraining(
+        folder,
+        parameters.total,
+        lambda train, val: train_ppo(train, val, folder, parameters, reward, resume=resume),
+    )
+
+
+def _make(kind: type, group: str, own: dict, groups: dict[str, dict]) -> Any:
+    """A dataclass of parameters from defaults of the command and what ``--set`` gives for its group.
+
+    Raises:
+        ValueError: an unknown parameter, or a value out of range or of another type.
+    """
+    given = groups.get(group, {})
+    known = [item.name for item in fields(kind)]
+    unknown = sorted(given.keys() - set(known))
+    if unknown:
+        raise ValueError(f"--set {group}.{unknown[0]}: known are {', '.join(known)}")
+    try:
+        return kind(**{**own, **given})
+    except TypeError as error:
+        raise ValueError(f"--set {group}: {error}") from error
+
+
+def _refuse_others(groups: dict[str, dict], known: tuple[str, ...]) -> None:
+    others = sorted(groups.keys() - set(known))
+    if others:
+        raise ValueError(f"--set {others[0]}: known are {', '.join(known)}")
