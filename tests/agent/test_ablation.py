@@ -7,7 +7,7 @@ import pytest
 from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
-from active6d_agent.environment.gym_environment import RewardParameters
+from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.evaluation import ablations as ablation
 from active6d_agent.evaluation.policy_evaluation import all_starts, run_named
 from active6d_agent.policies.attention.ppo import PpoParameters

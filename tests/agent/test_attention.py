@@ -8,12 +8,13 @@ import torch
 from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
-from active6d_agent.environment.gym_environment import Active6DEnv, Active6DVectorEnv, RewardParameters
+from active6d_agent.environment.episodes import RewardParameters
+from active6d_agent.environment.gym_environment import Active6DEnv, Active6DVectorEnv
 from active6d_agent.policies.attention.network import (
     AttentionNetwork,
     AttentionPolicy,
     ObjectAttention,
-    encode,
+    encode_observations,
     load_network,
     save_network,
 )
@@ -173,7 +174,7 @@ def test_the_deployed_policy_sees_what_the_environment_shows(lookup, network, tm
                 np.ones(100, bool),
                 6 - len(views),
             )
-            for name, values in encode(seen, 5).items():
+            for name, values in encode_observations([seen], 5).items():
                 np.testing.assert_allclose(values[0], observation[name], atol=1e-6, err_msg=name)
             decision = policy.decide(seen)
             batch = {name: torch.from_numpy(values[None]) for name, values in observation.items()}

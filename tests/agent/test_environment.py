@@ -1,5 +1,8 @@
 """The environment: fusion as the node's, rewards from the equations, Gymnasium's own checks."""
 
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,14 +12,11 @@ from hypothesis import strategies as st
 from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
-from active6d_agent.environment.gym_environment import (
-    ENVIRONMENT_ID,
-    MAX_OBJECTS,
-    Active6DEnv,
-    Active6DVectorEnv,
-    RewardParameters,
-)
+from active6d_agent.environment.episodes import RewardParameters
+from active6d_agent.environment.gym_environment import Active6DEnv, Active6DVectorEnv
+from active6d_agent.environment.registration import ENVIRONMENT_ID
 from active6d_agent.environment.throughput import measure_steps_per_second
+from active6d_agent.policies.registry import MAX_OBJECTS
 from active6d_core.camera import DEFAULT_CAMERA
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import e_add, evaluate_scene
@@ -163,6 +163,12 @@ def test_gymnasium_is_content(lookup):
         MAX_OBJECTS,
         6,
     )
+
+
+def test_importing_the_package_registers_the_environment():
+    code = "import gymnasium, active6d_agent, sys; print(gymnasium.spec('Active6D-v0').entry_point)"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert shown.strip() == "active6d_agent.environment.gym_environment:Active6DEnv"
 
 
 def test_the_vector_environment_is_many_single_ones(lookup):

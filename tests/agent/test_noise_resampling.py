@@ -7,9 +7,10 @@ import pytest
 from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.rollout import measure
 from active6d_agent.evaluation.noise_resampling import ablate_noise_resampling, join_banks, search_unforeseen
 from active6d_agent.evaluation.oracle import search_views, worth
-from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, measure, run_named
+from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, run_named
 
 STEPS = 3
 

@@ -8,7 +8,7 @@ from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import SceneBank, load_bank, observe_scene
-from active6d_agent.evaluation import policy_evaluation as evaluation
+from active6d_agent.environment.rollout import observe
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.ros.conversions import (
@@ -111,7 +111,7 @@ def test_observations_hold_what_each_episode_has_seen():
     views[1, 2:] = views[3, 1:] = -1
     explainer, grid = Explainer(lookup.model, lookup.parameters.explained_within), lookup.bank.grid
     for _ in range(2):  # what was worked out once is looked up then
-        observations = evaluation.observe(lookup, scene, views, np.full(5, 2))
+        observations = observe(lookup, scene, views, np.full(5, 2))
         for index, taken, observation in zip(scene, views, observations, strict=True):
             bits = [np.unpackbits(lookup.bank.scenes[index].surface[view]) for view in taken[taken >= 0]]
             shown = grid.centres[np.any(bits, axis=0)[: len(grid)]]

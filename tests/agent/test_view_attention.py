@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.rollout import observe
 from active6d_agent.evaluation.oracle import search_views, tally, worth
-from active6d_agent.evaluation.policy_evaluation import all_starts, observe, run_named, run_policy
+from active6d_agent.evaluation.policy_evaluation import all_starts, run_named, run_policy
 from active6d_agent.policies.registry import create_policy
 from active6d_agent.policies.view_attention import dagger as dagger
 from active6d_agent.policies.view_attention import features as scene_state

@@ -9,7 +9,8 @@ import typer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from active6d_agent.evaluation.policy_evaluation import EpisodeResults, Intervals, describe, summarise
+from active6d_agent.environment.rollout import EpisodeResults
+from active6d_agent.evaluation.policy_evaluation import Intervals, describe, summarise
 from active6d_tools.cli import app
 from active6d_tools.results import goals as goals
 from active6d_tools.results import page as page

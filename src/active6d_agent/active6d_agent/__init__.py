@@ -1,1 +1,8 @@
-"""Where to look next: object attention, policies and baselines, and what trains and evaluates them."""
+"""View planning: policies, the environment that they are trained in, and their evaluation.
+
+Importing this package registers the environment ``Active6D-v0`` where Gymnasium is installed.
+"""
+
+from active6d_agent.environment.registration import register_environment
+
+register_environment()

@@ -80,7 +80,7 @@ def _plan_dagger(folder: Path, common: dict, length: int | None, groups: dict, r
 
 
 def _plan_ppo(folder: Path, common: dict, length: int | None, groups: dict, resume: bool) -> PolicyTraining:
-    from active6d_agent.environment.gym_environment import RewardParameters
+    from active6d_agent.environment.episodes import RewardParameters
     from active6d_agent.policies.attention.ppo import PpoParameters, train_ppo
 
     own = {"total": length} if length else {}

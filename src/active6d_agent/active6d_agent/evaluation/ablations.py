@@ -12,7 +12,7 @@ import numpy as np
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import SceneBank
-from active6d_agent.environment.gym_environment import RewardParameters
+from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.evaluation.policy_evaluation import Intervals, describe, run_named
 from active6d_agent.policies.attention.network import ATTENTION_RULES
 from active6d_agent.policies.attention.ppo import PpoParameters, train_ppo

@@ -11,8 +11,9 @@ import numpy as np
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import SceneBank
+from active6d_agent.environment.rollout import measure
 from active6d_agent.evaluation.oracle import worth
-from active6d_agent.evaluation.policy_evaluation import Intervals, describe, measure, run_named
+from active6d_agent.evaluation.policy_evaluation import Intervals, describe, run_named
 from active6d_core.view_sphere import ViewSphere
 
 

@@ -1,43 +1,18 @@
 """The paper's Table 1 on a bank: every policy from the same starts, with paired intervals and bounds beside them."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.rollout import EpisodeResults, measure, roll_out
 from active6d_agent.evaluation.oracle import search_views
 from active6d_agent.policies.registry import Observation, Policy, create_policy
 
 BOUNDS = ("oracle", "all-views")
-MEASURES = ("detection_rate", "e_add_mm", "distance_m")
 _RESAMPLES = 2000
 # Episodes between two reports of progress.
 _TOGETHER = 100
-
-
-@dataclass(frozen=True, eq=False)
-class EpisodeResults:
-    """What E episodes of one policy ended with.
-
-    Attributes:
-        scene: (E,) indices.
-        detection_rate: (E,) fraction of the objects.
-        e_add_mm: (E,) mean over the objects, 50 mm for the missed.
-        distance_m: (E,) along the hemisphere.
-        views: (E, T + 1) views taken, -1 after an early stop.
-    """
-
-    scene: np.ndarray
-    detection_rate: np.ndarray
-    e_add_mm: np.ndarray
-    distance_m: np.ndarray
-    views: np.ndarray
-
-    @property
-    def measures(self) -> dict[str, np.ndarray]:
-        """The paper's three measures by name, (E,) each."""
-        return {name: getattr(self, name) for name in MEASURES}
 
 
 def all_starts(lookup: BatchedFusion, sample: int | None = None, seed: int = 0) -> np.ndarray:
@@ -68,75 +43,20 @@ def run_policy(
         steps: moves T.
         seed: each episode's randomness follows from it and its start.
         allowed: (M,) bool, views in reach, all when None.
-        metres: budget of each episode.
+        metres: travel budget of each episode.
     """
     scene = starts[:, 0]
-    views = np.full((len(starts), steps + 1), -1)
-    views[:, 0] = starts[:, 1]
     policies = [make_policy(index) for index in scene]
     for policy, start in zip(policies, starts.tolist(), strict=True):
         policy.reset(np.random.default_rng([seed, *start]))
-    running = np.arange(len(starts))
-    for step in range(steps):
-        if not len(running):
-            break
-        left = np.full(len(running), steps - step)
-        observations = observe(lookup, scene[running], views[running], left, allowed=allowed, metres=metres)
-        for episode, observation in zip(running, observations, strict=True):
-            decision = policies[episode].decide(observation)
-            views[episode, step + 1] = -1 if decision.stop else decision.view
-        running = running[views[running, step + 1] >= 0]
+
+    def choose(running: np.ndarray, observations: list[Observation]) -> np.ndarray:
+        decisions = [policies[index].decide(each) for index, each in zip(running, observations, strict=True)]
+        return np.array([-1 if decision.stop else decision.view for decision in decisions])
+
+    moves = np.full(len(starts), steps)
+    views = roll_out(lookup, choose, scene, starts[:, 1], moves, allowed=allowed, metres=metres)
     return measure(lookup, scene, views)
-
-
-def observe(
-    lookup: BatchedFusion,
-    scene: np.ndarray,
-    views: np.ndarray,
-    left: np.ndarray,
-    *,
-    allowed: np.ndarray | None = None,
-    metres: float = np.inf,
-) -> list[Observation]:
-    """What a policy sees after (E, v) views, -1 padding at the end, with (E,) moves left.
-
-    Args:
-        lookup: of the bank.
-        scene: (E,) indices.
-        views: taken so far, at least one.
-        left: of the budget.
-        allowed: (M,) bool, views in reach, all when None.
-        metres: budget of each episode from its beginning.
-    """
-    allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
-    count = (views >= 0).sum(axis=1)
-    current = views[np.arange(len(views)), count - 1]
-    fused = lookup.fuse(scene, views, current)
-    described = zip(lookup.describe(fused, scene, current), lookup.unexplained(fused, scene, views), strict=True)
-    observations = []
-    for (objects, unexplained), taken, number, moves in zip(described, views, count, left, strict=True):
-        positions = lookup.sphere.positions[taken[:number]]
-        metres_left = metres - lookup.sphere.path_length(positions)
-        observation = Observation(
-            objects, positions, lookup.sphere, allowed, int(moves), metres_left, unexplained=unexplained
-        )
-        observations.append(observation)
-    return observations
-
-
-def measure(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
-    """Score (E, v) views, -1 padding, taken in order."""
-    last = np.take_along_axis(views, (views >= 0).sum(axis=1, keepdims=True) - 1, axis=1)[:, 0]
-    scores = lookup.evaluate(lookup.fuse(scene, views, last), scene)
-    positions = lookup.sphere.positions[views]
-    arcs = np.where(views[:, 1:] >= 0, lookup.sphere.arc(positions[:, :-1], positions[:, 1:]), 0.0)
-    return EpisodeResults(
-        scene=scene,
-        detection_rate=np.array([score.detection_rate for score in scores]),
-        e_add_mm=np.array([score.mean_e_add_mm for score in scores]),
-        distance_m=arcs.sum(axis=1),
-        views=views,
-    )
 
 
 def run_named(

@@ -5,8 +5,9 @@ that is none, they stop.
 """
 
 import numpy as np
+from scipy.special import softmax
 
-from active6d_agent.policies.registry import Decision, Observation, register_policy, softmax
+from active6d_agent.policies.registry import Decision, Observation, register_policy
 from active6d_core.object_model import ObjectModel
 
 #: A hypothesis closer to the attended one than this fraction of the diameter is the same object, so it hides nothing.

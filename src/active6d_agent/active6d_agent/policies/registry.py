@@ -18,6 +18,8 @@ from active6d_core.view_sphere import ViewSphere
 
 #: Trained policies that come with this package.
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
+#: Learned policies look at this many objects at most.
+MAX_OBJECTS = 64
 #: A view of the grid counts as visited when the camera was this close to it, metres of arc.
 VISITED_WITHIN = 0.01
 
@@ -150,9 +152,3 @@ def create_policy(name: str, model: ObjectModel, **parameters: Any) -> Policy:
 def uniform_attention(count: int) -> np.ndarray:
     """(n,) equal weights that sum to one."""
     return np.full(count, 1.0 / max(count, 1))
-
-
-def softmax(logits: np.ndarray) -> np.ndarray:
-    """(n,) logits to (n,) weights that sum to one; empty in, empty out."""
-    weights = np.exp(logits - logits.max(initial=-np.inf))
-    return weights / weights.sum() if len(weights) else weights

@@ -11,8 +11,8 @@ import numpy as np
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import find_bank, load_bank
+from active6d_agent.environment.rollout import observe
 from active6d_agent.evaluation.oracle import known
-from active6d_agent.evaluation.policy_evaluation import observe
 from active6d_agent.policies.view_attention.dagger import stand_for
 from active6d_agent.policies.view_attention.features import represent
 from active6d_core.object_model import ObjectModel, load_object

@@ -14,8 +14,9 @@ from torch import nn
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import find_bank, load_bank
+from active6d_agent.environment.rollout import EpisodeResults, measure
 from active6d_agent.evaluation.oracle import known
-from active6d_agent.evaluation.policy_evaluation import EpisodeResults, Intervals, all_starts, measure, run_named
+from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, run_named
 from active6d_core.metrics import DETECTION_FRACTION
 from active6d_sim.scenes.scene_store import SPLITS, load_scene
 

@@ -4,20 +4,20 @@ Registered as ``attention``. :mod:`active6d_agent.policies.attention.ppo` trains
 with a JSON file of the configuration beside it; loading them executes no code.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import nn
 
-from active6d_agent.environment.gym_environment import MAX_OBJECTS
+from active6d_agent.policies.attention.encoding import FEATURES, decode, encode
 from active6d_agent.policies.policy_weights import load_weights, save_weights
 from active6d_agent.policies.registry import Decision, Observation, register_policy, weights_path
 from active6d_core.object_model import ObjectModel
 
 #: What a state consists of beside the history: o_t (12) and the camera's position (3).
 _STATE = 15
-_FEATURES = 6
 #: How the attended object is chosen.
 ATTENTION_RULES = ("learned", "lowest-score")
 
@@ -42,8 +42,8 @@ class ObjectAttention(nn.Module):
         if rule not in ATTENTION_RULES:
             raise ValueError(f"attention: no rule '{rule}', there are {', '.join(ATTENTION_RULES)}")
         self.rule = rule
-        self.fc = nn.Sequential(nn.Linear(_FEATURES, _FEATURES), nn.ReLU())
-        self.selector = nn.Linear(2 * _FEATURES, 1)
+        self.fc = nn.Sequential(nn.Linear(FEATURES, FEATURES), nn.ReLU())
+        self.selector = nn.Linear(2 * FEATURES, 1)
 
     def forward(self, objects: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Attend to one object of each scene.
@@ -143,30 +143,28 @@ class AttentionPolicy:
         if not candidates.any():
             return Decision.stop_here(observation)
         with torch.inference_mode():
-            mean, weight, index = self.network(encode(observation, self.network.steps))
-        count = min(len(observation.objects), MAX_OBJECTS)
-        attention = np.zeros(len(observation.objects))
-        attention[:count] = weight[0, :count].double().numpy()
-        azimuth, elevation = mean[0].double().clamp(-1.0, 1.0).tolist()
-        goal = observation.sphere.position(np.pi * azimuth, np.pi / 4 * (elevation + 1.0))
-        closeness = np.where(candidates, observation.sphere.positions @ goal, -np.inf)
+            mean, weight, index = self.network(encode_observations([observation], self.network.steps))
+        count = len(observation.objects)
+        weight = weight[0, :count].double().numpy()
+        # Objects beyond those that the network looks at have none.
+        attention = np.zeros(count)
+        attention[: len(weight)] = weight
+        view = decode(mean.double().clamp(-1.0, 1.0).numpy(), observation.sphere, candidates[None])[0]
         attended = int(index[0]) if count else None
-        return Decision.go_to(observation, int(closeness.argmax()), attention / max(attention.sum(), 1e-12), attended)
+        return Decision.go_to(observation, view, attention / max(attention.sum(), 1e-12), attended)
 
 
-def encode(observation: Observation, steps: int) -> dict[str, torch.Tensor]:
-    """One observation as a batch of one, equal to :meth:`~active6d_agent.environment.gym_environment.Episodes.observe`.
+def encode_observations(observations: Sequence[Observation], steps: int) -> dict[str, torch.Tensor]:
+    """Network inputs of B observations.
 
     Args:
-        observation: of the policy.
-        steps: horizon T of the network; of a longer history the last T positions are kept.
+        observations: of a policy.
+        steps: horizon T of the network.
     """
-    unit = observation.positions / observation.sphere.radius
-    features = observation.objects.features()[:MAX_OBJECTS]
-    objects, mask = np.zeros((1, MAX_OBJECTS, _FEATURES), np.float32), np.zeros((1, MAX_OBJECTS), np.float32)
-    history = np.zeros((1, steps, 3), np.float32)
-    objects[0, : len(features)], mask[0, : len(features)] = features, 1.0
-    past = unit[:-1][-steps:]
-    history[0, : len(past)] = past
-    arrays = {"objects": objects, "mask": mask, "camera": unit[-1:].astype(np.float32), "history": history}
-    return {name: torch.from_numpy(values) for name, values in arrays.items()}
+    encoded = []
+    for observation in observations:
+        features = observation.objects.features()[None]
+        positions = observation.positions[None] / observation.sphere.radius
+        moves = np.array([len(observation.positions) - 1])
+        encoded.append(encode(features, np.ones(features.shape[:2], bool), positions, moves, steps))
+    return {name: torch.from_numpy(np.concatenate([each[name] for each in encoded])) for name in encoded[0]}

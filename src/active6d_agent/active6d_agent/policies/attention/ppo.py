@@ -19,8 +19,19 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
-from active6d_agent.environment.gym_environment import Active6DVectorEnv, Episodes, RewardParameters
-from active6d_agent.policies.attention.network import ATTENTION_RULES, AttentionNetwork, ObjectAttention, save_network
+from active6d_agent.environment.episodes import RewardParameters
+from active6d_agent.environment.gym_environment import Active6DVectorEnv
+from active6d_agent.environment.rollout import measure, roll_out
+from active6d_agent.evaluation.policy_evaluation import all_starts
+from active6d_agent.policies.attention.encoding import decode
+from active6d_agent.policies.attention.network import (
+    ATTENTION_RULES,
+    AttentionNetwork,
+    ObjectAttention,
+    encode_observations,
+    save_network,
+)
+from active6d_agent.policies.registry import Observation
 from active6d_core.files import atomic_file, write_file
 
 
@@ -283,16 +294,16 @@ def _make_ppo(lookup: BatchedFusion, parameters: PpoParameters, reward: RewardPa
 
 def validate(network: AttentionNetwork, lookup: BatchedFusion, steps: int) -> tuple[float, float, float]:
     """Detection rate, e_ADD (mm) and metres of the network's mean actions over all scenes and starting views."""
-    scenes, views = len(lookup.bank.scenes), len(lookup.sphere)
-    episodes = Episodes(lookup, scenes * views, steps)
-    everything = np.arange(scenes * views)
-    episodes.begin(everything, np.random.default_rng(0), everything // views, everything % views)
-    with torch.inference_mode():
-        for _ in range(steps):
-            observation = {name: torch.from_numpy(values) for name, values in episodes.observe().items()}
-            mean, _, index = network(observation)
-            episodes.move(np.column_stack([mean.clamp(-1.0, 1.0).double().numpy(), index.numpy()]))
-    return tuple(float(values.mean()) for values in episodes.results().values())
+    starts = all_starts(lookup)
+
+    def choose(_: np.ndarray, observations: list[Observation]) -> np.ndarray:
+        with torch.inference_mode():
+            mean = network(encode_observations(observations, network.steps))[0]
+        candidates = np.stack([observation.candidates() for observation in observations])
+        return decode(mean.double().clamp(-1.0, 1.0).numpy(), lookup.sphere, candidates)
+
+    views = roll_out(lookup, choose, starts[:, 0], starts[:, 1], np.full(len(starts), steps))
+    return tuple(float(values.mean()) for values in measure(lookup, starts[:, 0], views).measures.values())
 
 
 def _checkpoint(ppo: PPO, folder: Path, state: dict) -> None:
@@ -315,7 +326,7 @@ def _restore(ppo: PPO, folder: Path, identity: dict) -> tuple[tuple[float, float
     except Exception as error:  # safetensors raises its own kinds
         raise ValueError(f"{path}: nothing to resume from ({error})") from error
     if any(state.get(key) != value for key, value in identity.items()):
-        raise ValueError(f"{path}: was trained with other parameters; start anew without resuming")
+        raise ValueError(f"{path}: was trained with other parameters; start again without resuming")
     ppo.policy.load_state_dict({k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")})
     adam: dict[int, dict[str, torch.Tensor]] = {}
     for key, value in tensors.items():

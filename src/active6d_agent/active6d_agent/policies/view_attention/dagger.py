@@ -8,7 +8,7 @@ views. States are those that the learner itself comes to (DAgger), with some ran
 import json
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -17,10 +17,11 @@ import torch
 from torch.optim.swa_utils import AveragedModel
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.environment.rollout import MEASURES, Choose, measure, roll_out
 from active6d_agent.evaluation.oracle import known
-from active6d_agent.evaluation.policy_evaluation import MEASURES, all_starts, measure, observe, run_named
-from active6d_agent.policies.registry import Observation
-from active6d_agent.policies.view_attention.features import MAX_OBJECTS, SceneState, gather, represent
+from active6d_agent.evaluation.policy_evaluation import all_starts, run_named
+from active6d_agent.policies.registry import MAX_OBJECTS, Observation
+from active6d_agent.policies.view_attention.features import SceneState, gather, represent
 from active6d_agent.policies.view_attention.network import (
     GAINS,
     ViewAttention,
@@ -226,17 +227,15 @@ def validate(
     network: ViewAttention, lookup: BatchedFusion, starts: np.ndarray, steps: int
 ) -> tuple[float, float, float]:
     """Detection rate, e_ADD (mm) and metres of the network's moves from (E, 2) starts."""
-    views = np.full((len(starts), steps + 1), -1)
-    views[:, 0] = starts[:, 1]
-    played = roll_out(lookup, greedy(network, lookup.model), starts[:, 0], views, np.full(len(starts), steps))
-    result = measure(lookup, starts[:, 0], played)
-    return float(result.detection_rate.mean()), float(result.e_add_mm.mean()), float(result.distance_m.mean())
+    moves = np.full(len(starts), steps)
+    views = roll_out(lookup, greedy(network, lookup.model), starts[:, 0], starts[:, 1], moves)
+    return tuple(float(values.mean()) for values in measure(lookup, starts[:, 0], views).measures.values())
 
 
-def greedy(network: ViewAttention, model: ObjectModel) -> Callable[[list[Observation]], np.ndarray]:
-    """Observations to (B,) views of most worth."""
+def greedy(network: ViewAttention, model: ObjectModel) -> Choose:
+    """Always the view of most worth."""
 
-    def choose(observations: list[Observation]) -> np.ndarray:
+    def choose(_: np.ndarray, observations: list[Observation]) -> np.ndarray:
         states = [represent(each, model) for each in observations]
         return _worths(network, observations, states).argmax(axis=1)
 
@@ -248,33 +247,6 @@ def _worths(network: ViewAttention, observations: list[Observation], states: lis
     parts = [slice(start, start + _TOGETHER) for start in range(0, len(observations), _TOGETHER)]
     values = [value_views(network, observations[part], states[part], network.weighing) for part in parts]
     return np.concatenate([each.worth for each in values])
-
-
-def roll_out(
-    lookup: BatchedFusion,
-    choose: Callable[[list[Observation]], np.ndarray],
-    scene: np.ndarray,
-    views: np.ndarray,
-    left: np.ndarray,
-) -> np.ndarray:
-    """Play E episodes to their ends.
-
-    Args:
-        lookup: of the bank.
-        choose: observations to (B,) views.
-        scene: (E,) indices.
-        views: (E, v) taken so far, -1 padding at the end, with room for the rest.
-        left: (E,) moves left.
-
-    Returns:
-        (E, v) all views taken.
-    """
-    views, left = views.copy(), left.copy()
-    while (running := np.flatnonzero(left > 0)).size:
-        count = (views[running] >= 0).sum(axis=1)
-        views[running, count] = choose(observe(lookup, scene[running], views[running], left[running]))
-        left[running] -= 1
-    return views
 
 
 def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
@@ -382,30 +354,28 @@ class _Learner:
         """Play episodes as the learner does now, and label every state on the way."""
         lookup, rng, count = self.lookup, self.rng, self.parameters.episodes
         scene = rng.integers(len(lookup.bank.scenes), size=count)
-        left = rng.integers(1, self.parameters.longest + 1, size=count)
-        views = np.full((count, self.parameters.longest + 1), -1)
-        views[:, 0] = rng.integers(len(lookup.sphere), size=count)
+        moves = rng.integers(1, self.parameters.longest + 1, size=count)
+        start = rng.integers(len(lookup.sphere), size=count)
+        paths = [[view] for view in start]
         # The oracle leads until the learner has learned something.
         lead = max(0.0, 1.0 - 5.0 * self.round / self.parameters.rounds)
 
-        def choose(observations: list[Observation]) -> np.ndarray:
-            running = np.flatnonzero(left > 0)
+        def choose(running: np.ndarray, observations: list[Observation]) -> np.ndarray:
             states = [represent(each, lookup.model) for each in observations]
             values = _worths(self.network, observations, states)
-            visited = zip(scene[running], views[running], left[running], states, strict=True)
             gains = [
-                candidate_gains(lookup, index, taken[taken >= 0], moves, state.patches)
-                for index, taken, moves, state in visited
+                candidate_gains(lookup, scene[index], np.array(paths[index]), each.steps_left, state.patches)
+                for index, each, state in zip(running, observations, states, strict=True)
             ]
             self.memory.extend(Example(state, *both) for state, both in zip(states, gains, strict=True))
             self.states += len(observations)
             truths = [(now + later).sum(axis=1) @ [1.0, self._weighing.error_weight] for now, later in gains]
             best = [self._best(truth, worth, lead) for truth, worth in zip(truths, values, strict=True)]
-            views[running, (views[running] >= 0).sum(axis=1)] = best
-            left[running] -= 1
+            for index, view in zip(running, best, strict=True):
+                paths[index].append(view)
             return np.array(best)
 
-        roll_out(lookup, choose, scene, views, left)
+        roll_out(lookup, choose, scene, start, moves)
 
     def _best(self, truth: np.ndarray, worth: np.ndarray, lead: float) -> int:
         """The next view of a training episode."""

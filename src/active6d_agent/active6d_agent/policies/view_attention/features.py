@@ -13,14 +13,12 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
-from active6d_agent.policies.registry import Observation
+from active6d_agent.policies.registry import MAX_OBJECTS, Observation
 from active6d_core.object_model import ObjectModel
 from active6d_perception.compiled import compiled
 from active6d_perception.model.model_views import model_views
 from active6d_perception.scene.expected_visibility import Tray, expected_visibility
 
-#: Objects beyond these are left out, the best verified being kept.
-MAX_OBJECTS = 64
 #: Patches beyond these are left out, the largest being kept.
 MAX_PATCHES = 8
 #: What is known of an item, of an item and a view, and of a view, see :class:`SceneState` and :func:`gather`.

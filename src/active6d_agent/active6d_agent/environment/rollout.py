@@ -1,0 +1,131 @@
+"""Episodes on a scene bank, many side by side: what a policy observes, its moves, and the scores of what it saw.
+
+Evaluation and training share these functions; the Gymnasium environment shares the scoring.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from active6d_agent.bank.batched_fusion import BatchedFusion, FusedBatch
+from active6d_agent.policies.registry import Observation
+
+MEASURES = ("detection_rate", "e_add_mm", "distance_m")
+#: From (b,) indices of the running episodes and their observations to (b,) next views, -1 to stop.
+Choose = Callable[[np.ndarray, list[Observation]], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeResults:
+    """What E episodes of one policy ended with.
+
+    Attributes:
+        scene: (E,) indices.
+        detection_rate: (E,) fraction of the objects.
+        e_add_mm: (E,) mean over the objects, 50 mm for the missed.
+        distance_m: (E,) along the hemisphere.
+        views: (E, T + 1) views taken, -1 after an early stop.
+    """
+
+    scene: np.ndarray
+    detection_rate: np.ndarray
+    e_add_mm: np.ndarray
+    distance_m: np.ndarray
+    views: np.ndarray
+
+    @property
+    def measures(self) -> dict[str, np.ndarray]:
+        """The paper's three measures by name, (E,) each."""
+        return {name: getattr(self, name) for name in MEASURES}
+
+
+def roll_out(
+    lookup: BatchedFusion,
+    choose: Choose,
+    scene: np.ndarray,
+    start: np.ndarray,
+    moves: np.ndarray,
+    *,
+    allowed: np.ndarray | None = None,
+    metres: float = np.inf,
+) -> np.ndarray:
+    """Run E episodes to their ends.
+
+    Args:
+        lookup: of the bank.
+        choose: makes all moves of one step.
+        scene: (E,) indices.
+        start: (E,) first views.
+        moves: (E,) budget of each episode.
+        allowed: (M,) bool, views in reach, all when None.
+        metres: travel budget of each episode.
+
+    Returns:
+        (E, most moves + 1) views taken in order, -1 where an episode had ended.
+    """
+    views = np.full((len(scene), moves.max(initial=0) + 1), -1)
+    views[:, 0] = start
+    running, step = np.flatnonzero(moves > 0), 0
+    while len(running):
+        left = moves[running] - step
+        observations = observe(lookup, scene[running], views[running], left, allowed=allowed, metres=metres)
+        step += 1
+        views[running, step] = choose(running, observations)
+        running = running[(views[running, step] >= 0) & (moves[running] > step)]
+    return views
+
+
+def observe(
+    lookup: BatchedFusion,
+    scene: np.ndarray,
+    views: np.ndarray,
+    left: np.ndarray,
+    *,
+    allowed: np.ndarray | None = None,
+    metres: float = np.inf,
+) -> list[Observation]:
+    """What a policy sees after (E, v) views, -1 padding at the end, with (E,) moves left.
+
+    Args:
+        lookup: of the bank.
+        scene: (E,) indices.
+        views: taken so far, at least one.
+        left: of the budget.
+        allowed: (M,) bool, views in reach, all when None.
+        metres: budget of each episode from its beginning.
+    """
+    allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
+    count = (views >= 0).sum(axis=1)
+    current = views[np.arange(len(views)), count - 1]
+    fused = lookup.fuse(scene, views, current)
+    described = zip(lookup.describe(fused, scene, current), lookup.unexplained(fused, scene, views), strict=True)
+    observations = []
+    for (objects, unexplained), taken, number, moves in zip(described, views, count, left, strict=True):
+        positions = lookup.sphere.positions[taken[:number]]
+        metres_left = metres - lookup.sphere.path_length(positions)
+        observation = Observation(
+            objects, positions, lookup.sphere, allowed, int(moves), metres_left, unexplained=unexplained
+        )
+        observations.append(observation)
+    return observations
+
+
+def measure(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
+    """Score (E, v) views, -1 padding, taken in order."""
+    last = np.take_along_axis(views, (views >= 0).sum(axis=1, keepdims=True) - 1, axis=1)[:, 0]
+    return score_fused(lookup, lookup.fuse(scene, views, last), scene, views)
+
+
+def score_fused(lookup: BatchedFusion, fused: FusedBatch, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
+    """Score what fusion made of (E, v) views, -1 padding, taken in order."""
+    scores = lookup.evaluate(fused, scene)
+    positions = lookup.sphere.positions[views]
+    arcs = np.where(views[:, 1:] >= 0, lookup.sphere.arc(positions[:, :-1], positions[:, 1:]), 0.0)
+    return EpisodeResults(
+        scene=scene,
+        detection_rate=np.array([score.detection_rate for score in scores]),
+        e_add_mm=np.array([score.mean_e_add_mm for score in scores]),
+        distance_m=arcs.sum(axis=1),
+        views=views,
+    )
