@@ -16,13 +16,13 @@ from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, canonical_frame_of
 from active6d_perception.estimators.dense.decoding import DecodingParameters
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
-from active6d_perception.estimators.dense.network import HEADS, DenseNetwork, NetworkSize, split
+from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize, split
 from active6d_perception.estimators.dense.network_input import output_camera, ray_frames, ray_rotation, reduction
 from active6d_perception.estimators.dense.sphere_bins import CENTRES
 from active6d_perception.estimators.dense.trained_network import TrainedNetwork, load_network, save_network
 from active6d_perception.estimators.dense.training.augmentation import augment, crop
 from active6d_perception.estimators.dense.training.batches import TrainingViews, batches, input_tensor
-from active6d_perception.estimators.dense.training.loop import TrainingOptions, train
+from active6d_perception.estimators.dense.training.loop import TrainingOptions, _Run, train
 from active6d_perception.estimators.dense.training.losses import LossWeights, loss_terms, total
 from active6d_perception.estimators.dense.training.samples import make_sample, read_shard, write_shard
 from active6d_perception.estimators.dense.training.targets import make_targets
@@ -350,6 +350,77 @@ def test_training_goes_on_where_it_stopped(tmp_path, trained, mug_view):
     (tmp_path / "state.safetensors").write_bytes(b"broken")
     with pytest.raises(ValueError, match=r"state\.safetensors: cannot go on"):
         train(model, shards, [mug_view[0]], tmp_path, quick())
+
+
+def test_the_learning_rate_of_a_resumed_training_follows_the_schedule(tmp_path, trained, mug_view):
+    folder, _ = trained
+    options = quick(steps=8, checkpoint_every=3, validate_every=9, warmup=5)
+
+    def interrupt(report):
+        if report.step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(load_object("mug"), [folder / "views.npz"], [mug_view[0]], tmp_path, options, on_step=interrupt)
+    expected = [2e-3 * min(1, (step + 1) / 5) * 0.5 * (1 + np.cos(np.pi * step / 8)) for step in (0, 3)]
+    for where, rate in zip((tmp_path / "none", tmp_path), expected, strict=True):
+        assert _Run(where, options, "cpu")._optimizer.param_groups[0]["lr"] == pytest.approx(rate)
+
+
+def test_averaged_weights_follow_the_current_ones(mug_view, tmp_path):
+    run = _Run(tmp_path, quick(warmup=1), "cpu")
+    model = load_object("mug")
+    item = mug_view[0]
+    inputs = input_tensor(item.view, model.diameter)[None]
+    targets = [make_targets(item, canonical_frame_of(model), model.diameter)]
+    expected = None
+    for step in range(1, 4):
+        run.advance(inputs, targets)
+        current = run._network.answer[1].bias.detach().clone()
+        keep = min(0.998, step / (step + 10))
+        expected = current if expected is None else keep * expected + (1 - keep) * current
+    averaged = run.averaged_on_cpu()
+    assert torch.allclose(averaged.answer[1].bias, expected, atol=1e-7)
+    assert not torch.allclose(expected, current, atol=1e-4)
+    assert averaged.down0[0][1].num_batches_tracked == 3
+
+
+def test_a_network_without_coordinates_heads_is_trained_and_deployed(tmp_path, trained, mug_view):
+    folder, _ = trained
+    model, (sample, _, view) = load_object("mug"), mug_view
+    options = quick(loss=LossWeights(coordinates=0))
+    best = train(model, [folder / "views.npz"], [sample], tmp_path, options)
+    assert json.loads(best.with_suffix(".json").read_text())["heads"] == DEPLOYED_HEADS
+    network = load_network(best, model)
+    answer = DenseEstimator(model, network).ask(sample.view)
+    assert len(answer) == sum(HEADS.values()) - 4
+    assert create_estimator("dense", model, weights=str(best)).estimate(view).segmentation.shape == view.depth.shape
+    fitted = DenseParameters(decoding=DecodingParameters(coordinates=True))
+    with pytest.raises(ValueError, match="without the coordinates heads"):
+        DenseEstimator(model, network, fitted).locate(sample.view)
+
+
+def test_the_coordinates_heads_do_not_change_what_is_deployed(mug_view):
+    sample, _, _ = mug_view
+    model = load_object("mug")
+    canonical_frame = canonical_frame_of(model)
+    answer = right_answer(sample, make_targets(sample, canonical_frame, model.diameter))
+    deployed = np.concatenate([part for name, part in split(answer, axis=0).items() if name in DEPLOYED_HEADS])
+    estimator = DenseEstimator(
+        model, TrainedNetwork(DenseNetwork(SMALL), canonical_frame, "mug", model.diameter, SMALL)
+    )
+    found = []
+    for output in (answer, deployed):
+        estimator.ask = lambda view, output=output: output
+        found.append(estimator.locate(sample.view)[0])
+    assert len(found[0].score) == 4
+    assert (found[0].T_camera_object == found[1].T_camera_object).all()
+    assert (found[0].score == found[1].score).all()
+
+
+def test_an_output_of_another_width_is_refused():
+    with pytest.raises(ValueError, match="7 channels"):
+        split(np.zeros((1, 7)))
 
 
 def test_validation_rates_a_perfect_network(mug_view, monkeypatch):

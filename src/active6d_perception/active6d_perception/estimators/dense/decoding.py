@@ -78,11 +78,16 @@ def decode(
         canonical_frame: that the network was trained with.
         diameter: of the object, metres.
         parameters: thresholds.
+
+    Raises:
+        ValueError: ``parameters`` ask for a fit of coordinates that the network does not predict.
     """
     probability = expit(answer[0])
     pixel = np.flatnonzero((probability > parameters.mask_threshold) & np.isfinite(depth))
     # Channels last, as the network answers, this is a view and each pixel's answer is together.
     parts = split(np.moveaxis(answer, 0, -1).reshape(-1, len(answer))[pixel])
+    if parameters.coordinates and "coordinates" not in parts:
+        raise ValueError("this network was trained without the coordinates heads")
     points = pixel_rays(camera).reshape(-1, 3)[pixel] * depth.ravel()[pixel, None]
     votes = points + diameter * np.einsum("pij,pj->pi", ray_frames(camera).reshape(-1, 3, 3)[pixel], parts["centre"])
     weight = np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))

@@ -1,5 +1,6 @@
-"""The network: a small U-shaped convolutional net with one answer for every second input pixel each way."""
+"""The network of the dense estimator: a small U-Net whose output has half the resolution of its input."""
 
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 
@@ -9,9 +10,9 @@ from torch.nn.utils import fuse_conv_bn_eval
 
 from active6d_perception.estimators.dense.network_input import CHANNELS
 
-#: Directions on the sphere among which the second direction of the axis frame is told, as a distribution.
+#: Number of bins on the sphere over which the network predicts the direction of the axis frame's x.
 DIRECTION_BINS = 64
-#: Name and channels of each part of the answer, in the order they come.
+#: Name and number of channels of each part of the network's output, in their order.
 HEADS = {
     "mask": 1,  # logit: an object or not
     "centre": 3,  # from the surface point to the axis frame's origin, in the frame of the pixel's ray, diameters
@@ -19,9 +20,11 @@ HEADS = {
     "coordinates": 3,  # the surface point in the canonical frame, diameters
     "coordinates_scale": 1,  # logarithm of the Laplace scale of its error
     "axis": 3,  # the axis frame's z in the frame of the ray through its origin; not normalised
-    "axis_line": 6,  # xx, yy, zz, xy, yz, zx of the axis: it without its sign, which is learned sooner
-    "direction": DIRECTION_BINS,  # logits: the axis frame's x in that same frame
+    "axis_line": 6,  # products xx, yy, zz, xy, yz, zx of the axis: the axis without its sign, which is learned sooner
+    "direction": DIRECTION_BINS,  # logits: the axis frame's x, in the frame of the ray through its origin
 }
+#: The heads that deployment decodes; the others only serve the comparison in ``docs/estimator.md``.
+DEPLOYED_HEADS = {name: channels for name, channels in HEADS.items() if not name.startswith("coordinates")}
 
 
 @dataclass(frozen=True)
@@ -39,17 +42,27 @@ class NetworkSize:
 
 
 class DenseNetwork(nn.Module):
-    """(n, CHANNELS, h, w) input, both sides multiples of 16, to (n, sum of HEADS, h / 2, w / 2)."""
+    """(n, CHANNELS, h, w) input, both sides multiples of 16, to (n, channels of all heads, h / 2, w / 2).
 
-    def __init__(self, size: NetworkSize = NetworkSize()) -> None:
+    Attributes:
+        heads: name and number of channels of each part of the output, in their order.
+    """
+
+    def __init__(self, size: NetworkSize = NetworkSize(), heads: Mapping[str, int] = HEADS) -> None:
+        """
+        Args:
+            size: channels of the layers.
+            heads: :data:`HEADS` or :data:`DEPLOYED_HEADS`.
+        """
         super().__init__()
+        self.heads = dict(heads)
         fine, middle, coarse, coarsest = size.widths
         self.down0 = nn.Sequential(_convolution(CHANNELS, fine, stride=2), _convolution(fine, fine))
         self.down1 = nn.Sequential(_convolution(fine, middle, stride=2), Residual(middle))
         self.down2 = nn.Sequential(_convolution(middle, coarse, stride=2), Residual(coarse))
         self.down3 = nn.Sequential(_convolution(coarse, coarsest, stride=2), Residual(coarsest), Residual(coarsest))
         self.up2, self.up1, self.up0 = Merge(coarsest, coarse), Merge(coarse, middle), Merge(middle, fine)
-        self.answer = nn.Sequential(_convolution(fine, size.last), nn.Conv2d(size.last, sum(HEADS.values()), 1))
+        self.answer = nn.Sequential(_convolution(fine, size.last), nn.Conv2d(size.last, sum(heads.values()), 1))
 
     def forward(self, x: Tensor) -> Tensor:
         x0 = self.down0(x)
@@ -60,7 +73,7 @@ class DenseNetwork(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two convolutions around which the input is passed on."""
+    """Two convolutions, added to their input."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -72,7 +85,7 @@ class Residual(nn.Module):
 
 
 class Merge(nn.Module):
-    """What comes up from a coarse resolution is added to the finer one's features and smoothed."""
+    """Enlarges coarse features, adds them to finer ones and smooths the sum."""
 
     def __init__(self, coarse: int, fine: int) -> None:
         super().__init__()
@@ -91,7 +104,7 @@ def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 
 
 def fused(network: DenseNetwork) -> DenseNetwork:
-    """A copy for inference, each normalisation merged into the convolution before it: the same answers, sooner."""
+    """A copy for inference with each batch normalisation merged into the convolution before it."""
     network = deepcopy(network).eval()
     for module in list(network.modules()):
         if isinstance(module, nn.Sequential) and len(module) > 1 and isinstance(module[1], nn.BatchNorm2d):
@@ -108,9 +121,16 @@ def has_fast_bfloat16(device: str = "cpu") -> bool:
 
 
 def split(answer, axis: int = 1) -> dict:
-    """The parts of an answer by the names of :data:`HEADS`; views of a torch tensor or NumPy array along ``axis``."""
+    """The network's output by head: views of a torch tensor or NumPy array, cut along ``axis``.
+
+    Raises:
+        ValueError: the number of channels is neither that of :data:`HEADS` nor that of :data:`DEPLOYED_HEADS`.
+    """
+    heads = {sum(heads.values()): heads for heads in (HEADS, DEPLOYED_HEADS)}.get(answer.shape[axis])
+    if heads is None:
+        raise ValueError(f"the output of the network has {answer.shape[axis]} channels, which fits no list of heads")
     parts, start = {}, 0
-    for name, channels in HEADS.items():
+    for name, channels in heads.items():
         parts[name] = answer[(slice(None),) * axis + (slice(start, start + channels),)]
         start += channels
     return parts

@@ -12,7 +12,7 @@ from active6d_core.files import atomic_file, write_file
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import is_rigid
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
-from active6d_perception.estimators.dense.network import HEADS, DenseNetwork, NetworkSize
+from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize
 from active6d_perception.estimators.dense.network_input import CHANNELS
 
 _FORMAT = 1
@@ -52,7 +52,7 @@ def save_network(path: Path, trained: TrainedNetwork) -> None:
         "object": trained.object_name,
         "diameter": trained.diameter,
         "input_channels": CHANNELS,
-        "heads": HEADS,
+        "heads": trained.network.heads,
         "size": asdict(trained.size),
         "turn": trained.canonical_frame.turn.value,
         "T_object_axis": trained.canonical_frame.T_object_axis.tolist(),
@@ -76,7 +76,8 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
         )
         if not is_rigid(canonical_frame.T_object_axis, 1e-5):
             raise ValueError("T_object_axis is not a rigid transform")
-        network = DenseNetwork(size)
+        heads = HEADS if description["heads"] == HEADS else DEPLOYED_HEADS
+        network = DenseNetwork(size, heads)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path.with_suffix('.json')}: bad description of a network ({error})") from error
     try:
@@ -106,11 +107,8 @@ def _read_description(path: Path, model: ObjectModel) -> dict:
             f"{described}: made for {made_for} ({1000 * diameter:.1f} mm), "
             f"not for {model.name} ({1000 * model.diameter:.1f} mm); {_advice(model)}"
         )
-    if (description.get("format"), description.get("input_channels"), description.get("heads")) != (
-        _FORMAT,
-        CHANNELS,
-        HEADS,
-    ):
+    version = description.get("format"), description.get("input_channels")
+    if version != (_FORMAT, CHANNELS) or description.get("heads") not in (HEADS, DEPLOYED_HEADS):
         raise ValueError(f"{described}: made by another version of the network; {_advice(model)}")
     return description
 

@@ -5,18 +5,27 @@ import math
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel
 
 from active6d_core.files import atomic_file, write_file
 from active6d_core.object_model import ObjectModel
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import canonical_frame_of
-from active6d_perception.estimators.dense.network import DenseNetwork, NetworkSize, has_fast_bfloat16
+from active6d_perception.estimators.dense.network import (
+    DEPLOYED_HEADS,
+    HEADS,
+    DenseNetwork,
+    NetworkSize,
+    has_fast_bfloat16,
+)
 from active6d_perception.estimators.dense.trained_network import TrainedNetwork, save_network
 from active6d_perception.estimators.dense.training.batches import TrainingViews, batches
 from active6d_perception.estimators.dense.training.curves import draw_curves
@@ -158,20 +167,22 @@ class _Run:
     def __init__(self, folder: Path, options: TrainingOptions, device: str) -> None:
         torch.manual_seed(options.seed)
         self._options, self._device = options, torch.device(device)
-        self._network = DenseNetwork(options.size).to(self._device, memory_format=torch.channels_last).train()
-        self._averaged = deepcopy(self._network).eval()
-        self._optimizer = torch.optim.AdamW(self._network.parameters(), weight_decay=options.weight_decay)
+        network = DenseNetwork(options.size, HEADS if options.loss.coordinates else DEPLOYED_HEADS)
+        self._network = network.to(self._device, memory_format=torch.channels_last).train()
+        self._averaged = AveragedModel(self._network, avg_fn=partial(_average, options.averaging), use_buffers=True)
+        # The scheduler reads the initial rate from here when it goes on with a training.
+        groups = [{"params": list(self._network.parameters()), "initial_lr": options.learning_rate}]
+        self._optimizer = torch.optim.AdamW(groups, options.learning_rate, weight_decay=options.weight_decay)
         self._state_file = folder / "state.safetensors"
         self.step = 0
         self.loss = math.nan
         self.history: list[dict[str, float]] = []
         if self._state_file.is_file():
             self._load()
+        self._schedule = LambdaLR(self._optimizer, partial(_learning_rate_share, options), last_epoch=self.step - 1)
 
     def advance(self, inputs: Tensor, targets: list) -> dict[str, float]:
         """One step of the optimiser; the loss's terms."""
-        for group in self._optimizer.param_groups:
-            group["lr"] = self._options.learning_rate * _schedule(self.step, self._options)
         inputs = inputs.to(self._device, memory_format=torch.channels_last)
         with torch.autocast(self._device.type, torch.bfloat16, enabled=has_fast_bfloat16(self._device.type)):
             answer = self._network(inputs)
@@ -181,30 +192,20 @@ class _Run:
         loss.backward()
         nn.utils.clip_grad_norm_(self._network.parameters(), _CLIP)
         self._optimizer.step()
+        self._schedule.step()
+        self._averaged.update_parameters(self._network)
         self.step += 1
-        self._average()
         self.loss = loss.item()
         return {name: value.item() for name, value in terms.items()}
 
     def averaged_on_cpu(self) -> DenseNetwork:
         """A copy of the averaged network."""
-        return deepcopy(self._averaged).cpu().eval()
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        factor = min(self._options.averaging, self.step / (self.step + 10))
-        for average, current in zip(
-            self._averaged.state_dict().values(), self._network.state_dict().values(), strict=True
-        ):
-            if average.is_floating_point():
-                average.lerp_(current, 1 - factor)
-            else:
-                average.copy_(current)
+        return deepcopy(self._averaged.module).cpu().eval()
 
     def save(self) -> None:
         """Write tensors and history; an interruption leaves the previous state."""
         tensors = {f"network.{name}": tensor for name, tensor in self._network.state_dict().items()}
-        tensors |= {f"averaged.{name}": tensor for name, tensor in self._averaged.state_dict().items()}
+        tensors |= {f"averaged.{name}": tensor for name, tensor in self._averaged.module.state_dict().items()}
         for index, state in self._optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
         progress = {"step": self.step, "options": asdict(self._options), "history": self.history}
@@ -221,7 +222,8 @@ class _Run:
                 raise ValueError("it was begun with other options")
             tensors = load_file(self._state_file, device=str(self._device))
             self._network.load_state_dict(_under(tensors, "network."))
-            self._averaged.load_state_dict(_under(tensors, "averaged."))
+            self._averaged.module.load_state_dict(_under(tensors, "averaged."))
+            self._averaged.n_averaged.fill_(progress["step"])
             state: dict[int, dict[str, Tensor]] = {}
             for name, tensor in _under(tensors, "optimizer.").items():
                 index, key = name.split(".")
@@ -239,7 +241,14 @@ def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
-def _schedule(step: int, options: TrainingOptions) -> float:
+def _average(factor: float, averaged: Tensor, current: Tensor, count: Tensor) -> Tensor:
+    """Exponential moving average after ``count`` updates; the first updates count more. Integers are copied."""
+    if not averaged.is_floating_point():
+        return current
+    return torch.lerp(averaged, current, 1 - ((count + 1) / (count + 11)).clamp(max=factor))
+
+
+def _learning_rate_share(options: TrainingOptions, step: int) -> float:
     """Share of the highest learning rate: a linear warm-up, then half a cosine to zero."""
     warm = min(1.0, (step + 1) / options.warmup)
     return warm * 0.5 * (1 + math.cos(math.pi * step / options.steps))

@@ -16,7 +16,10 @@ SCALE_RANGE = (-5.8, 0.4)
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weight of each term; 0 switches a head's training off."""
+    """Weight of each term of the loss; 0 leaves a head untrained.
+
+    With ``coordinates`` 0 the network has no coordinates heads, which deployment does not use.
+    """
 
     mask: float = 1.0
     centre: float = 2.0
@@ -45,10 +48,11 @@ def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
     terms = {"mask": F.binary_cross_entropy_with_logits(answer[:, 0], mask)}
     pixel = torch.cat([torch.from_numpy(target.pixel + i * height * width) for i, target in enumerate(targets)])
     parts = split(answer.movedim(1, -1).reshape(-1, answer.shape[1])[pixel.to(answer.device)], axis=1)
-    wanted = {name: _gather(targets, name, answer) for name in ("weight", "centre", "coordinates", "axis", "direction")}
+    points = [name for name in ("centre", "coordinates") if name in parts]
+    wanted = {name: _gather(targets, name, answer) for name in ("weight", *points, "axis", "direction")}
     weight = wanted["weight"] / wanted["weight"].sum().clamp(min=1.0)
     terms["scale"] = answer.new_zeros(())
-    for name in ("centre", "coordinates"):
+    for name in points:
         log_scale = parts[f"{name}_scale"][:, 0].clamp(*SCALE_RANGE)
         error = (parts[name] - wanted[name]).norm(dim=1)
         terms[name] = (weight * error).sum()
