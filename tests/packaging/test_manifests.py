@@ -4,6 +4,7 @@ import ast
 import re
 import runpy
 import sys
+from functools import cache
 from pathlib import Path
 from unittest import mock
 
@@ -14,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = sorted(path.name for path in (ROOT / "src").glob("active6d_*"))
 ROS = set(
     "ament_index_python builtin_interfaces diagnostic_msgs geometry_msgs launch launch_ros lifecycle_msgs "
-    "rcl_interfaces rclpy rosgraph_msgs sensor_msgs std_msgs std_srvs visualization_msgs".split()
+    "rcl_interfaces rclpy ros2launch rosgraph_msgs sensor_msgs std_msgs std_srvs visualization_msgs".split()
 )
 # import: (rosdep key, None where there is none that is new enough and without CUDA; name on PyPI)
 LIBRARIES = {
@@ -41,11 +42,16 @@ LIBRARIES = {
     "typer": (None, "typer"),
     "yaml": ("python3-yaml", "pyyaml"),
 }
-# `ros2 launch` itself
-NOT_IMPORTED = {"ros2launch"}
+# What a package needs and no import shows: `ros2 launch` itself, and the packages whose nodes bringup loads by name.
+NOT_IMPORTED = {"active6d_bringup": {"active6d_agent", "active6d_perception", "ros2launch"}}
+# Only training needs these. They are extras of the agent: the tools ask for them, a robot leaves them out.
+TRAINING = {"gymnasium", "stable_baselines3"}
+# The study that compares runtimes uses these where they are installed.
+OPTIONAL = {"onnxruntime", "openvino"}
 
 
-def imports(package: str) -> set[str]:
+@cache
+def imports(package: str) -> frozenset[str]:
     """Top-level names that a package's sources and launch files import, the standard library and itself left out."""
     names = set()
     for path in [*(ROOT / "src" / package / package).rglob("*.py"), *(ROOT / "src" / package).glob("launch/*.py")]:
@@ -54,7 +60,16 @@ def imports(package: str) -> set[str]:
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 names.add(node.module.split(".")[0])
-    return names - set(sys.stdlib_module_names) - {package}
+    return frozenset(names - set(sys.stdlib_module_names) - OPTIONAL - {package})
+
+
+def dependencies(package: str) -> set[str]:
+    """Import names that package.xml and setup.py must declare."""
+    needed = imports(package) | NOT_IMPORTED.get(package, set())
+    assert needed <= ROS | LIBRARIES.keys() | set(PACKAGES), "add new libraries to LIBRARIES"
+    if package == "active6d_agent":
+        return needed - TRAINING
+    return needed | TRAINING if package == "active6d_tools" else needed
 
 
 def setup_arguments(package: str) -> dict:
@@ -79,10 +94,8 @@ def test_package_xml_declares_what_is_imported(package):
     assert not warnings
     assert manifest.package_format == 3
     assert manifest.get_build_type() == "ament_python"
-    imported = imports(package)
-    assert imported <= ROS | LIBRARIES.keys() | set(PACKAGES), "add new libraries to LIBRARIES"
-    keys = {LIBRARIES[name][0] if name in LIBRARIES else name for name in imported} - {None}
-    assert {dependency.name for dependency in manifest.exec_depends} - NOT_IMPORTED == keys
+    keys = {LIBRARIES[name][0] if name in LIBRARIES else name for name in dependencies(package)} - {None}
+    assert {dependency.name for dependency in manifest.exec_depends} == keys
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -93,25 +106,21 @@ def test_setup_py_agrees_with_package_xml(package):
     assert arguments["version"] == manifest.version
     assert arguments["description"] == manifest.description
     assert arguments["license"] == manifest.licenses[0]
-    libraries = {LIBRARIES[name][1] if name in LIBRARIES else name for name in imports(package) - ROS}
+    libraries = {LIBRARIES[name][1] if name in LIBRARIES else name for name in dependencies(package) - ROS}
+    if package == "active6d_tools":  # the agent brings along what trains it
+        libraries -= {LIBRARIES[name][1] for name in TRAINING}
+        libraries = libraries - {"active6d_agent"} | {"active6d_agent[training]"}
     assert set(arguments["install_requires"]) == libraries
 
 
-def test_layers_of_the_packages():
-    allowed = {
-        "active6d_core": set(),
-        "active6d_sim": {"active6d_core"},
-        "active6d_perception": {"active6d_core"},
-        "active6d_agent": {"active6d_core", "active6d_perception"},
-        "active6d_bringup": {"active6d_core", "active6d_perception", "active6d_agent"},
-        "active6d_tools": set(PACKAGES),
-    }
-    for package in PACKAGES:
-        assert imports(package) & set(PACKAGES) <= allowed[package]
+def test_the_agent_leaves_training_to_an_extra():
+    extras = setup_arguments("active6d_agent")["extras_require"]
+    assert {name: set(needed) for name, needed in extras.items()} == {"training": {LIBRARIES[n][1] for n in TRAINING}}
+    assert imports("active6d_agent") >= TRAINING
 
 
 def test_requirements_are_what_is_imported():
-    imported = set.union(*(imports(package) for package in PACKAGES)) & LIBRARIES.keys()
+    imported = frozenset.union(*(imports(package) for package in PACKAGES)) & LIBRARIES.keys()
     pinned = {name for name in pins("requirements.txt") if not name.startswith("ros-jazzy-")}
     assert pinned == {LIBRARIES[name][1] for name in imported}
 
@@ -122,7 +131,17 @@ def test_no_version_is_pinned_twice():
 
 
 def test_what_rosdep_has_no_key_for_is_in_the_docker_requirements():
-    imported = set.union(*(imports(package) for package in PACKAGES))
+    imported = frozenset.union(*(imports(package) for package in PACKAGES))
     without_key = {LIBRARIES[name][1] for name in imported & LIBRARIES.keys() if LIBRARIES[name][0] is None}
     lines = (ROOT / "docker/requirements.txt").read_text().splitlines()
-    assert without_key <= {re.split("[=<>]", line)[0] for line in lines}
+    assert without_key == {re.split("[=<>]", line)[0] for line in lines if not line.startswith("#")}
+
+
+def test_only_the_simulator_asks_rosdep_for_pybullet():
+    """rosdep has a key for pybullet, so nothing skips keys; a robot does not build the simulator."""
+    needing = {path.parent.name for path in (ROOT / "src").glob("*/package.xml") if "pybullet" in path.read_text()}
+    assert needing == {"active6d_sim"}
+    for name in ("docker/Dockerfile", "docs/install.md"):
+        text = (ROOT / name).read_text()
+        assert "rosdep install" in text
+        assert "--skip-keys" not in text, name
