@@ -63,15 +63,16 @@ def test_finds_a_lone_object(name):
         assert np.nanmean(view.depth[mask]) == pytest.approx(found.depth[best])
 
 
-# Measured on 12 views of two heaps (docs/perception.md): .93, .72, .88 found and .96, .86, .99 right, by ADD-S.
-@pytest.mark.parametrize(("name", "found", "right"), [("coffee_cup", 0.6, 0.7), ("bunny", 0.4, 0.6), ("mug", 0.6, 0.7)])
-def test_finds_most_of_what_a_heap_shows(name, found, right):
+# Measured on these two views by ADD-S: 16 of 20, 9 of 9 and 14 of 17 found, and every hypothesis right. One or two
+# objects may be lost before the test fails. On 12 views of two heaps it is .93, .72, .88 (docs/perception.md).
+@pytest.mark.parametrize(("name", "found"), [("coffee_cup", 0.70), ("bunny", 0.85), ("mug", 0.75)])
+def test_finds_most_of_what_a_heap_shows(name, found):
     model = load_object(name)
     result = evaluate_estimator(create_estimator("geometric", model), model, captures(model, (45, 70), seed=11))
     assert result.detection_rate(0.5, "adds") >= found
     is_right = result.right("adds")
-    assert is_right.mean() >= right
-    assert result.gather("verification")[is_right].mean() > 0.5
+    assert is_right.mean() > 0.9
+    assert result.gather("verification")[is_right].mean() > 0.8
 
 
 def test_is_deterministic_and_looks_at_depth_only():

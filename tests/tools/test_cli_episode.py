@@ -10,6 +10,7 @@ from active6d_bringup.bags.reader import read_episode
 from active6d_bringup.graph import episode as episode_module
 from active6d_bringup.graph.composition import NODES
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted
+from active6d_bringup.graph.processes import ProcessError
 from active6d_core.metrics import evaluate_scene
 from active6d_core.object_model import load_object
 from active6d_tools.cli import app
@@ -83,18 +84,26 @@ def test_episode_report_and_replay(tmp_path, run):
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "words"),
+    ("error", "options", "code", "line"),
     [
-        (EpisodeError("no answer from pose_estimator"), 1, "no answer from pose_estimator"),
-        (EpisodeInterrupted(), 130, ""),
+        (EpisodeError("no answer from pose_estimator"), [], 1, "active6d: no answer from pose_estimator"),
+        (ProcessError("camera_simulator died"), [], 1, "active6d: camera_simulator died"),
+        (EpisodeInterrupted(), [], 130, "active6d: interrupted"),
+        (
+            EpisodeInterrupted(),
+            ["--bag", "/nowhere/bag"],
+            130,
+            "active6d: interrupted; /nowhere/bag holds what was recorded",
+        ),
     ],
 )
-def test_an_episode_that_fails_is_one_line(monkeypatch, run, error, code, words):
+def test_an_episode_that_fails_is_one_line(monkeypatch, run, error, options, code, line):
     def fail(*arguments):
         raise error
 
     monkeypatch.setattr(episode_module, "run_episode", fail)
-    result = run("episode", "--estimator", "stub")
+    result = run("episode", "--estimator", "stub", *options)
     assert result.exit_code == code
-    assert words in result.stderr.splitlines()[-1]
+    assert result.stderr.splitlines()[-1] == line
+    assert result.stdout == ""
     assert "Traceback" not in result.stderr

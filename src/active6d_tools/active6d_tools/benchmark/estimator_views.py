@@ -115,15 +115,9 @@ def measure_estimators(
     store = Records(records, {"object": object_name, "split": split, "seed": seed})
     rng = np.random.default_rng(seed)
     pairs = _draw_views(rng, len(scenes), sample)
-    views, verifier = GridViews(model, scenes, seed), Verifier(model)
-    tasks = [(*pair, noise, contender) for pair in pairs for noise in noises for contender in contenders]
-    for done, (scene, view, noise, contender) in enumerate(tasks):
-        on_progress(f"{contender.name}, {scenes[scene].name}, view {view}", done, len(tasks))
-        key = (contender.identity, noise, scene, view)
-        if key not in store:
-            labelled = views.capture(scene, view, noise)
-            store.add(key, evaluate_view(contender.estimator, verifier, model, labelled))
-    on_progress("views", len(tasks), len(tasks))
+    walks = [[int(view) for view in rng.permutation(len(ViewSphere()))[: moves + 1]] for _ in scenes]
+    views = GridViews(model, scenes, seed)
+    tasks = _measure_views(contenders, views, pairs, noises, store, on_progress)
     results = {
         (noise, contender.name): EstimatorResult(
             model.diameter, tuple(store[contender.identity, noise, scene, view] for scene, view in pairs)
@@ -134,10 +128,9 @@ def measure_estimators(
     rows: dict[str, dict[str, Any]] = {f"{noise:g}": {} for noise in noises}
     for (noise, name), result in results.items():
         rows[f"{noise:g}"][name] = summarise(model, result, [scene for scene, _ in pairs])
-    walks = [[int(view) for view in rng.permutation(len(ViewSphere()))[: moves + 1]] for _ in scenes]
     for contender in contenders:
         if moves and contender.name not in PEERS:
-            on_progress(f"{contender.name}, fused", len(tasks), len(tasks))
+            on_progress(f"{contender.name}, fused", tasks, tasks)
             episodes = ([views.capture(scene, view, noises[0]) for view in walk] for scene, walk in enumerate(walks))
             fused = detection_over_views(contender.estimator, model, episodes).mean(axis=0)
             rows[f"{noises[0]:g}"][contender.name]["fused"] = fused.tolist()
@@ -151,6 +144,27 @@ def measure_estimators(
         "noise": rows,
     }
     return Measurement(document, results)
+
+
+def _measure_views(
+    contenders: Sequence[Contender],
+    views: GridViews,
+    pairs: Sequence[tuple[int, int]],
+    noises: Sequence[float],
+    store: Records,
+    on_progress: OnProgress,
+) -> int:
+    """Run every estimator on every view that ``store`` has no result of; the number of results."""
+    verifier = Verifier(views.model)
+    tasks = [(*pair, noise, contender) for pair in pairs for noise in noises for contender in contenders]
+    for done, (scene, view, noise, contender) in enumerate(tasks):
+        on_progress(f"{contender.name}, {views.scenes[scene].name}, view {view}", done, len(tasks))
+        key = (contender.identity, noise, scene, view)
+        if key not in store:
+            labelled = views.capture(scene, view, noise)
+            store.add(key, evaluate_view(contender.estimator, verifier, views.model, labelled))
+    on_progress("views", len(tasks), len(tasks))
+    return len(tasks)
 
 
 def _draw_views(rng: np.random.Generator, scenes: int, sample: int | None) -> list[tuple[int, int]]:

@@ -27,7 +27,7 @@ class GridViews:
             scenes: by index.
             seed: of the sensor's noise and of the scenes' looks.
         """
-        self._model, self._scenes, self._seed = model, scenes, seed
+        self.model, self.scenes, self._seed = model, scenes, seed
         self._sphere = ViewSphere()
         self._simulator: Simulator | None = None
         self._rendered: tuple[tuple[int, int], RenderedView, np.ndarray] | None = None
@@ -35,7 +35,7 @@ class GridViews:
 
     def capture(self, index: int, number: int, noise: float) -> LabelledView:
         """View ``number`` of the grid of scene ``index``, with that factor on the sensor's noise."""
-        scene = self._scenes[index]
+        scene = self.scenes[index]
         T_world_camera = self._sphere.pose(self._sphere.positions[number])
         if self._simulator is None or self._simulator.scene is not scene:
             self._simulator = Simulator(scene, seed=self._seed)
