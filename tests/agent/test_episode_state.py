@@ -1,0 +1,138 @@
+"""Views that the camera refuses or does not reach are struck, and the episode ends with a reason."""
+
+import numpy as np
+import pytest
+
+from active6d_agent.policies.episode_state import MOST_MISSED, EpisodeState, Limits
+from active6d_agent.policies.registry import Decision, create_policy
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.object_model import load_object
+from active6d_core.view_sphere import ViewSphere
+
+SPHERE = ViewSphere()
+NOTHING = np.zeros((0, 3))
+
+
+def make_state(views=None, **limits):
+    allowed = np.ones(len(SPHERE), bool) if views is None else np.isin(np.arange(len(SPHERE)), views)
+    state = EpisodeState(1, Limits(SPHERE, allowed, **{"steps": 3, **limits}))
+    state.add_view(1, SPHERE.positions[0])
+    return state
+
+
+@pytest.fixture
+def policy():
+    policy = create_policy("max-distance", load_object("mug"))
+    policy.reset(np.random.default_rng(0))
+    return policy
+
+
+def decide(state, policy):
+    return state.decide(policy, SceneObjects.empty(), NOTHING)
+
+
+def test_refused_views_are_not_chosen_again(policy):
+    state = make_state()
+    views = []
+    for _ in range(3):
+        decision, reason = decide(state, policy)
+        assert reason == ""
+        views.append(decision.view)
+        assert state.refused("in the wall")
+    decision, reason = decide(state, policy)
+    assert (reason, decision.stop) == ("", False)
+    assert len({*views, decision.view}) == 4
+    # The policy takes the view farthest away: what follows is never farther than what was struck.
+    arcs = SPHERE.arc(SPHERE.positions[[*views, decision.view]], SPHERE.positions[0])
+    assert (np.diff(arcs) <= 1e-9).all()
+
+
+def test_struck_views_stay_struck_after_the_next_view(policy):
+    state = make_state(views=[5, 9])
+    first = decide(state, policy)[0].view
+    state.refused("no")
+    second = decide(state, policy)[0].view
+    assert {first, second} == {5, 9}
+    state.add_view(2, SPHERE.positions[second])
+    decision, reason = decide(state, policy)
+    assert decision.stop
+    assert reason == "no reachable view is left (1 refused by the camera, the last because: no)"
+
+
+def test_all_views_refused_ends_with_the_reason(policy):
+    state = make_state(views=[5, 9, 40])
+    for number in range(3):
+        assert decide(state, policy)[1] == ""
+        assert state.refused(f"reason {number}")
+    decision, reason = decide(state, policy)
+    assert decision.stop
+    assert reason == "no reachable view is left (3 refused by the camera, the last because: reason 2)"
+
+
+def test_a_refusal_after_arrival_strikes_nothing(policy):
+    state = make_state()
+    decide(state, policy)
+    state.reached()
+    assert not state.refused("stale goal")
+    assert not state.waiting
+    assert not state.wait(1e6)
+
+
+def test_a_goal_that_is_not_reached_in_time_is_struck(policy):
+    state = make_state(goal_timeout=2.0, views=[5, 9])
+    first = decide(state, policy)[0].view
+    assert [state.wait(0.5) for _ in range(4)] == [False, False, False, True]
+    second = decide(state, policy)[0].view
+    assert {first, second} == {5, 9}
+    assert not state.wait(1.5)  # each goal has its own two seconds
+    assert state.wait(0.5)
+    assert decide(state, policy)[1] == "no reachable view is left (2 not reached within 2 s)"
+
+
+def test_without_a_limit_the_camera_may_take_for_ever(policy):
+    state = make_state()
+    decide(state, policy)
+    assert not state.wait(1e9)
+    assert state.waiting
+
+
+def test_a_camera_that_reaches_nothing_ends_the_episode(policy):
+    state = make_state(goal_timeout=1.0)
+    for _ in range(MOST_MISSED - 1):
+        decide(state, policy)
+        assert state.wait(1.0)
+    decide(state, policy)
+    assert state.refused("it answers")  # the count starts again
+    for _ in range(MOST_MISSED):
+        assert decide(state, policy)[1] == ""
+        assert state.wait(1.0)
+    decision, reason = decide(state, policy)
+    assert decision is None
+    assert reason.startswith(f"the camera reached none of the last {MOST_MISSED} goals within 1 s each")
+
+
+def test_budgets_end_it(policy):
+    assert decide(make_state(steps=0), policy) == (None, "budget of 0 moves spent")
+    assert decide(make_state(metres=1e-3), policy)[1] == "no reachable view is left"
+
+
+class BesideTheGrid:
+    """Always asks for the same place, which is no view of the grid."""
+
+    place = SPHERE.position(np.radians(3.0), np.radians(46.0))
+
+    def decide(self, observation):
+        return Decision(self.place, None, np.zeros(0))
+
+
+def test_a_goal_beside_the_grid_gives_way_to_the_nearest_view():
+    state, policy = make_state(), BesideTheGrid()
+    np.testing.assert_array_equal(decide(state, policy)[0].position, policy.place)
+    state.refused("no")
+    views = []
+    for _ in range(2):
+        views.append(decide(state, policy)[0].view)
+        state.refused("no")
+    arcs = SPHERE.arc(SPHERE.positions, policy.place)
+    assert SPHERE.nearest(policy.place) not in views
+    assert sorted(views) == sorted(np.argsort(arcs, kind="stable")[1:3])
