@@ -21,7 +21,9 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.ros.node import GraphNode, run_node
+from active6d_core.ros.episode_messages import GoalState, GoalStatus, goal_status_to_message
+from active6d_core.ros.node import GraphNode
+from active6d_core.ros.runner import run_node
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import list_estimators, register_estimator
@@ -34,9 +36,14 @@ class StubCameraNode(GraphNode):
 
     def __init__(self, **arguments: Any) -> None:
         super().__init__("camera_simulator", **arguments)
-        self._object = self.declare("object", "mug", "what to say that it sees")
-        self._seed = self.declare("seed", 0, "of the noise")
-        self._deaf_from = self.declare("deaf_from", -1, "number of the first goal that is ignored, -1 for none")
+        self.declare("object", "mug", "name of the object to announce")
+        self.declare("seed", 0, "seed of the noise")
+        self.declare("refused", 0, "number of goals that are refused before any is accepted")
+        self.declare("ignored", 0, "number of goals after the refused ones that are accepted and never reached")
+        self.declare("deaf_from", -1, "number of the first goal that is ignored, -1: none")
+        self._object, self._seed = self.value("object"), self.value("seed")
+        self._refused, self._ignored = self.value("refused"), self.value("ignored")
+        self._deaf_from = self.value("deaf_from")
         self._pose = ViewSphere().pose(ViewSphere().positions[self._seed % 100])
         self._count = 0
         self._color = self.output(Image, "camera/color/image_raw", latched=True)
@@ -45,6 +52,7 @@ class StubCameraNode(GraphNode):
         self._where = self.output(PoseStamped, "camera/pose", latched=True)
         self._truth = self.output(PoseArray, "ground_truth/poses", latched=True)
         self._start = self.output(DiagnosticArray, "episode/start", latched=True)
+        self._status = self.output(DiagnosticArray, "view_goal/status", latched=True)
         self.input(PoseStamped, "view_goal", self._on_goal)
 
     def begin(self) -> None:
@@ -57,12 +65,25 @@ class StubCameraNode(GraphNode):
         self._publish()
 
     def _on_goal(self, message: PoseStamped) -> None:
-        if stamp_to_ns(message.header.stamp) < self._stamp():
+        stamp = stamp_to_ns(message.header.stamp)
+        if stamp < self._stamp():
             raise MessageError("stale goal")  # of a view that was estimated again
+        if self._refused:
+            self._refused -= 1
+            self._answer(stamp, GoalState.REFUSED, "a wall is in the way")
+            return
+        self._answer(stamp, GoalState.ACCEPTED)
+        if self._ignored:
+            self._ignored -= 1
+            return
         self._count += 1
         if self._count != self._deaf_from:
             self._pose = pose_stamped_to_transform(message, self.world_frame)
             self._publish()
+            self._answer(stamp, GoalState.REACHED)
+
+    def _answer(self, stamp: int, state: GoalState, reason: str = "") -> None:
+        self._status.publish(goal_status_to_message(GoalStatus(stamp, state, reason), self.world_frame))
 
     def _stamp(self) -> int:
         return 10**9 + self._count * 500_000_000

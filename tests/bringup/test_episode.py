@@ -10,9 +10,10 @@ from ros_harness import fresh_domain
 
 from active6d_bringup.bags.reader import read_episode
 from active6d_bringup.bags.replay import ReplaySettings, replay
-from active6d_bringup.bags.writer import CONTRACT, RecordingError
+from active6d_bringup.bags.writer import CONTRACT, TYPESTORE, RecordingError
 from active6d_bringup.graph.composition import NODES, GraphDescription
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, EpisodeSettings, describe, run_episode
+from active6d_core.ros.episode_messages import goal_status_from_message
 
 
 @pytest.fixture(autouse=True)
@@ -110,6 +111,50 @@ def test_camera_that_stops_answering_is_named(tmp_path):
     with pytest.raises(EpisodeError, match="no answer from camera_simulator"):
         run_episode(silent)
     assert len(read_episode(tmp_path / "bag").steps) == 2
+
+
+def goals_and_statuses(folder):
+    from rosbags.rosbag2 import Reader
+
+    goals, statuses = [], []
+    with Reader(folder) as reader:
+        for connection, _, payload in reader.messages():
+            if connection.topic == "/view_goal":
+                goals.append(TYPESTORE.deserialize_cdr(payload, connection.msgtype))
+            if connection.topic == "/view_goal/status":
+                statuses.append(goal_status_from_message(TYPESTORE.deserialize_cdr(payload, connection.msgtype)))
+    return goals, statuses
+
+
+def test_three_refused_goals_end_well_with_other_views(tmp_path):
+    result = run_episode(settings(tmp_path / "bag", overrides={"camera_simulator": {"refused": 3}}))
+    assert result.reason == "budget of 3 moves spent"
+    assert len(result.steps) == 4
+    goals, statuses = goals_and_statuses(tmp_path / "bag")
+    assert [status.state.value for status in statuses] == ["refused"] * 3 + ["accepted", "reached"] * 3
+    places = np.array([[getattr(goal.pose.position, axis) for axis in "xyz"] for goal in goals])
+    assert len(goals) == len(np.unique(places.round(6), axis=0)) == 6
+    record = read_episode(tmp_path / "bag")
+    np.testing.assert_allclose(record.positions[1:], places[3:], atol=1e-9)
+    np.testing.assert_allclose(record.steps[0].goal[:3, 3], places[3], atol=1e-9)  # the goal that was reached
+    np.testing.assert_allclose(result.steps[0].goal[:3, 3], places[3], atol=1e-9)
+
+
+def test_a_goal_that_is_never_reached_gives_way_after_its_timeout(tmp_path):
+    overrides = {"camera_simulator": {"ignored": 2}, "attention_policy": {"goal_timeout": 0.3}}
+    result = run_episode(settings(tmp_path / "bag", overrides=overrides))
+    assert (result.reason, len(result.steps)) == ("budget of 3 moves spent", 4)
+    goals, statuses = goals_and_statuses(tmp_path / "bag")
+    assert len(goals) == 5
+    assert [status.state.value for status in statuses] == ["accepted"] * 2 + ["accepted", "reached"] * 3
+
+
+def test_when_every_goal_is_refused_the_episode_ends_and_says_why(tmp_path):
+    overrides = {"camera_simulator": {"refused": 1000}, "attention_policy": {"reach_views": [1, 2, 3]}}
+    result = run_episode(settings(tmp_path / "bag", overrides=overrides))
+    expected = "no reachable view is left (3 refused by the camera, the last because: a wall is in the way)"
+    assert result.reason == read_episode(tmp_path / "bag").end_reason == expected
+    assert len(result.steps) == 1
 
 
 def test_what_a_node_refused_is_told(tmp_path):

@@ -32,7 +32,7 @@ def record(graph, folder, episode, late=False):
     early = list(first.items()) if late else []
     for topic, message in early:
         graph.publish(topic, message, latched=True, subscribers=0)
-    recorder = graph.add(EpisodeRecorderNode(context=graph.context, overrides={"bag": str(folder)}))
+    recorder = graph.add(EpisodeRecorderNode(context=graph.context, overrides={"bag": str(folder), "heartbeat": 0.0}))
     for topic, message in sent:
         if not any(message is other for _, other in early):
             graph.publish(topic, message, latched=is_latched(topic))
@@ -111,7 +111,9 @@ def test_mcap_library_decodes_by_the_schema_in_the_file(graph, tmp_path):
 
 
 def test_completeness_names_the_topics_awaited(graph, tmp_path):
-    recorder = graph.add(EpisodeRecorderNode(context=graph.context, overrides={"bag": str(tmp_path / "bag")}))
+    recorder = graph.add(
+        EpisodeRecorderNode(context=graph.context, overrides={"bag": str(tmp_path / "bag"), "heartbeat": 0.0})
+    )
     assert "episode/end" in graph.call(Trigger, "episode_recorder/complete").message
     sent = StubEpisode(moves=1).messages()
     last = sent[-1][1].header.stamp.sec * 10**9 + sent[-1][1].header.stamp.nanosec
@@ -141,7 +143,9 @@ def test_existing_folder_is_refused(graph, tmp_path):
 
 
 def test_namespace_is_kept(graph, tmp_path):
-    recorder = EpisodeRecorderNode(context=graph.context, namespace="cell", overrides={"bag": str(tmp_path / "bag")})
+    recorder = EpisodeRecorderNode(
+        context=graph.context, namespace="cell", overrides={"bag": str(tmp_path / "bag"), "heartbeat": 0.0}
+    )
     graph.add(recorder)
     for topic, message in StubEpisode().messages():
         graph.publish(topic if topic.startswith("/") else f"cell/{topic}", message, latched=is_latched(topic))
@@ -154,7 +158,7 @@ def test_namespace_is_kept(graph, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_recorder_closes_its_bag(graph, tmp_path, number):
     command = [sys.executable, "-m", "active6d_bringup.nodes.episode_recorder"]
-    command += ["--ros-args", "-p", f"bag:={tmp_path / 'bag'}"]
+    command += ["--ros-args", "-p", f"bag:={tmp_path / 'bag'}", "-p", "heartbeat:=0.0"]
     process = subprocess.Popen(command, env={**os.environ, "ROS_DOMAIN_ID": str(graph.domain)})
     try:
         sent = StubEpisode().messages()

@@ -7,6 +7,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
 from hand_made_scenes import SPHERE, store_mugs
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
@@ -20,6 +21,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
+from active6d_core.ros.episode_messages import GoalState, GoalStatus, goal_status_from_message
 from active6d_core.se3 import look_at
 from active6d_sim.nodes.camera_simulator import CameraSimulatorNode
 from active6d_sim.rendering.sensor import SensorNoise
@@ -34,6 +36,7 @@ TOPICS = {
     "ground_truth/poses": PoseArray,
     "episode/start": DiagnosticArray,
 }
+STATUS = "view_goal/status"
 VIEW = list(TOPICS)[:4]
 
 
@@ -53,6 +56,7 @@ class Watched:
     def __post_init__(self):
         self.boxes = {topic: self.graph.mailbox(kind, self.namespace + topic, True) for topic, kind in TOPICS.items()}
         self.diagnostics = self.graph.mailbox(DiagnosticArray, "/diagnostics")
+        self.answers = self.graph.mailbox(DiagnosticArray, self.namespace + STATUS, True)
 
     def start(self, **parameters):
         settings = {"scene": "mug/test/0", "width": 64, "height": 48, "start_view": 45, **parameters}
@@ -78,6 +82,9 @@ class Watched:
 
     def stamps(self, topic="camera/pose"):
         return [stamp_to_ns(message.header.stamp) for message in self.boxes[topic]]
+
+    def statuses(self):
+        return [goal_status_from_message(message) for message in self.answers]
 
     def errors(self):
         return [d.status[0].message for d in self.diagnostics if d.status[0].level == DiagnosticStatus.ERROR]
@@ -171,6 +178,9 @@ def test_bad_goals_are_refused_and_the_camera_stays(watched, snap):
         watched.publish(message)
         watched.graph.spin_until(lambda number=number: len(watched.errors()) == number, what=reason)
         assert reason in watched.errors()[-1]
+        watched.graph.spin_until(lambda number=number: len(watched.answers) == number)
+        assert watched.statuses()[-1].state == GoalState.REFUSED
+        assert reason in watched.statuses()[-1].reason
     assert len(watched.poses()) == 1
     watched.publish(goal_message())
     watched.wait(2)
@@ -183,12 +193,40 @@ def test_goals_decided_on_older_views_are_stale(watched):
     watched.goal(SPHERE.pose(SPHERE.positions[60]), stamp=SECOND)
     watched.wait(2)
     watched.goal(SPHERE.pose(SPHERE.positions[10]), stamp=SECOND)
-    watched.graph.spin_until(watched.errors)
-    assert "stale goal, decided at 1.000 s" in watched.errors()[0]
+    watched.graph.spin_until(lambda: len(watched.answers) == 3)
+    assert watched.statuses()[2].state == GoalState.REFUSED
+    assert "stale goal, decided at 1.000 s" in watched.statuses()[2].reason
     watched.goal(SPHERE.pose(SPHERE.positions[80]), stamp=watched.stamps()[1])
     watched.wait(3)
     same_pose(watched.poses()[2], SPHERE.pose(SPHERE.positions[80]))
     assert len(watched.poses()) == 3
+
+
+def test_every_goal_is_answered_with_its_own_stamp(watched):
+    watched.start()
+    watched.goal(SPHERE.pose(SPHERE.positions[60]), stamp=SECOND)
+    watched.wait(2)
+    watched.goal(SPHERE.pose(SPHERE.positions[10]), stamp=watched.stamps()[1])
+    watched.wait(3)
+    watched.graph.spin_until(lambda: len(watched.answers) == 4)
+    expected = [
+        GoalStatus(stamp, state) for stamp in watched.stamps()[:2] for state in (GoalState.ACCEPTED, GoalState.REACHED)
+    ]
+    assert watched.statuses() == expected
+
+
+def test_the_clock_is_the_stamp_of_the_last_view(watched):
+    clock = watched.graph.mailbox(Clock, "/clock")
+    watched.start(publish_clock=True)
+    watched.graph.spin_until(lambda: clock and stamp_to_ns(clock[-1].clock) == SECOND)
+    watched.goal(SPHERE.pose(SPHERE.positions[60]))
+    watched.wait(2)
+    watched.graph.spin_until(lambda: stamp_to_ns(clock[-1].clock) == watched.stamps()[1])
+
+
+def test_without_the_parameter_there_is_no_clock(watched):
+    watched.start()
+    assert watched.graph.node.count_publishers("/clock") == 0
 
 
 def test_same_seed_same_messages(graph):

@@ -17,6 +17,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
+from active6d_core.ros.episode_messages import GoalState, goal_status_from_message
 from active6d_core.se3 import look_at
 from active6d_sim.datasets.bop import write_bop_scene
 from active6d_sim.nodes.dataset_camera import DatasetCameraNode
@@ -51,6 +52,7 @@ class Watched:
         self.truth = graph.mailbox(PoseArray, "ground_truth/poses", True)
         self.starts = graph.mailbox(DiagnosticArray, "episode/start", True)
         self.diagnostics = graph.mailbox(DiagnosticArray, "/diagnostics")
+        self.answers = graph.mailbox(DiagnosticArray, "view_goal/status", True)
         overrides = {"scene": str(folder), "start_view": 0, **parameters}
         self.node = graph.add(DatasetCameraNode(context=graph.context, overrides=overrides))
         self.wait(1)
@@ -136,12 +138,14 @@ def test_bad_goals_are_refused_and_the_camera_stays(graph, folder):
         start=1,
     ):
         watched.goal(**goal)
-        graph.spin_until(lambda number=number: len(watched.errors()) == number, what=reason)
-        assert reason in watched.errors()[-1]
+        graph.spin_until(lambda number=number: len(watched.answers) == number, what=reason)
+        answer = goal_status_from_message(watched.answers[-1])
+        assert answer.state == GoalState.REFUSED
+        assert reason in answer.reason
     message = transform_to_pose_stamped(SPHERE.pose(SPHERE.positions[45]), 0, "world")
     message.pose.orientation.w = float("nan")
     graph.publish("view_goal", message)
-    graph.spin_until(lambda: len(watched.errors()) == 4)
+    graph.spin_until(lambda: len(watched.answers) == 4)
     assert len(watched.poses()) == 1
     watched.goal(90.0)
     watched.wait(2)
@@ -153,6 +157,9 @@ def test_an_image_that_broke_is_reported_and_the_camera_stays(graph, folder, rec
     watched.goal(90.0, stamp=SECOND)
     graph.spin_until(watched.errors)
     assert "depth/000001.png: not a readable image" in watched.errors()[0]
+    graph.spin_until(lambda: len(watched.answers) == 2)
+    states = [goal_status_from_message(message).state for message in watched.answers]
+    assert states == [GoalState.ACCEPTED, GoalState.REFUSED]
     watched.goal(200.0, stamp=SECOND)  # not stale: nothing has moved
     watched.wait(2)
     assert len(watched.poses()) == 2

@@ -14,6 +14,7 @@ from rclpy.qos import DurabilityPolicy
 
 from active6d_bringup.graph.composition import NODES, load_node_type
 from active6d_core.ros.node import GraphNode
+from active6d_core.ros.parameters import describe_limits
 
 ROOT = Path(__file__).parents[3]
 PARAMETER_FILE = ROOT / "src/active6d_bringup/config/active6d.yaml"
@@ -31,7 +32,7 @@ def parameters(node: GraphNode) -> Iterator[tuple[Parameter, str, str]]:
     for name in sorted(node.get_parameters_by_prefix("")):
         if not name.startswith(FOREIGN):
             descriptor = node.describe_parameter(name)
-            yield node.get_parameter(name), descriptor.description, descriptor.additional_constraints
+            yield node.get_parameter(name), descriptor.description, describe_limits(descriptor)
 
 
 def as_yaml(value: object) -> str:

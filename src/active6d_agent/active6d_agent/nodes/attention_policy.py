@@ -1,102 +1,141 @@
-"""Node ``attention_policy``: accumulated objects in, attention and the next view out, until the budget is spent."""
+"""Node ``attention_policy``: subscribes to the fused objects, publishes attention and the next view."""
 
-from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
+from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
-from active6d_agent.policies.registry import Decision, Observation, choose_policy, create_policy, list_policies
+from active6d_agent.policies.episode_state import EpisodeState, Limits
+from active6d_agent.policies.registry import Decision, choose_policy, create_policy, list_policies
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
 from active6d_core.ros.conversions import (
-    MessageError,
+    OutdatedError,
     attention_to_cloud,
     make_header,
     objects_from_cloud,
     points_from_cloud,
-    pose_stamped_to_transform,
     stamp_to_ns,
     transform_to_pose,
 )
-from active6d_core.ros.node import GraphNode, StampSynchronizer, run_node
+from active6d_core.ros.episode_messages import GoalState, goal_status_from_message
+from active6d_core.ros.heartbeat import Awaited
+from active6d_core.ros.node import GraphNode
+from active6d_core.ros.runner import run_node
+from active6d_core.ros.view_inputs import ViewInputs
 from active6d_core.view_sphere import ViewSphere
 
-
-@dataclass
-class _Episode:
-    """Views since ``start`` (ns), the camera's positions by stamp, and how it ended."""
-
-    start: int
-    positions: dict[int, np.ndarray] = field(default_factory=dict)
-    ended: bool = False
+#: What belongs to a view beside the camera's pose, part to topic.
+_OTHERS = {"objects": "objects", "unexplained": "objects/unexplained"}
+_TICKS_PER_TIMEOUT = 10
 
 
 class AttentionPolicyNode(GraphNode):
-    """Publishes ``attention`` and ``view_goal`` once a stamp's ``objects``, ``objects/unexplained`` and ``camera/pose``
-    are there, T times.
+    """Publishes ``attention`` and ``view_goal`` for each view whose objects, unexplained surface and pose are there.
 
-    After the T-th move, or when the policy stops, ``episode/end`` says why. A newer ``episode/start`` begins the next
+    A goal that the camera refuses or does not reach in time is replaced by another one with the same stamp. After T
+    moves, or when the policy stops, ``episode/end`` gives the reason. A newer ``episode/start`` begins the next
     episode; without one (a camera that knows no episodes) the first view does. The same view again publishes the same
     messages again.
     """
 
     def __init__(self, **node_arguments) -> None:
         super().__init__("attention_policy", **node_arguments)
-        self.object_name = self.declare("object", "mug", "name of the object that fills the bin")
-        policy = self.declare(
+        self.declare("object", "mug", "name of the object that fills the bin")
+        self.declare(
             "policy",
             AUTOMATIC,
-            "which policy chooses views; auto: the learned one where weights ship for the object",
+            "name of the policy that chooses views; auto: the learned one if it has weights for the object",
             choices=[AUTOMATIC, *list_policies()],
         )
-        self.policy_name = choose_policy(self.object_name) if policy == AUTOMATIC else policy
-        self.policy_parameters = self.declare("policy_parameters", "{}", "the policy's own parameters, a YAML mapping")
-        self.steps = self.declare("steps", 5, "budget of moves T; T moves are T + 1 views", minimum=0, maximum=10_000)
-        self.metres = self.declare("metres", 0.0, "budget of metres along the hemisphere, 0 for none", minimum=0.0)
-        self.seed = self.declare("seed", 0, "of the policy's randomness", minimum=0)
-        self.sphere, self.allowed = self._declare_views()
-        latched = self.declare("latched_camera", True, "camera/pose is transient-local, false for plain drivers")
+        self.declare("policy_parameters", "{}", "parameters of the policy, a YAML mapping")
+        self.declare("steps", 5, "budget of moves T; T moves give T + 1 views", minimum=0, maximum=10_000)
+        self.declare("metres", 0.0, "travel budget along the hemisphere in metres, 0: no limit", minimum=0.0)
+        self.declare("seed", 0, "seed of the policy's random generator", minimum=0)
+        self.declare(
+            "goal_timeout",
+            30.0,
+            "seconds in which the camera must reach a goal before another view is chosen, 0: no limit",
+            minimum=0.0,
+        )
+        self._declare_views()
         self.attention = self.output(PointCloud2, "attention")
         self.goal = self.output(PoseStamped, "view_goal")
         self.end = self.output(DiagnosticArray, "episode/end", latched=True)
         self.input(PointCloud2, "objects", self._on_objects, latched=True)
         self.input(PointCloud2, "objects/unexplained", self._on_unexplained, latched=True)
-        self.camera_input(PoseStamped, "camera/pose", self._on_pose, latched)
+        self._views = ViewInputs(self, ["pose"], self._on_view, _OTHERS)
         self.input(DiagnosticArray, "episode/start", self._on_start, latched=True)
+        self.input(DiagnosticArray, "view_goal/status", self._on_status, latched=True)
+        self._timer: Timer | None = None
         self._forget()
 
     def setup(self) -> None:
         """Load the object and the policy."""
         try:
-            parameters = yaml.safe_load(self.policy_parameters)
+            parameters = yaml.safe_load(self.value("policy_parameters"))
         except yaml.YAMLError:
             parameters = None
         if not isinstance(parameters, dict):
             raise ValueError(f"{self.get_name()}: parameter 'policy_parameters' must be a YAML mapping")
-        self.policy = create_policy(self.policy_name, load_object(self.object_name), **parameters)
+        timeout = self.value("goal_timeout")
+        self._limits = Limits(*self._read_views(), self.value("steps"), self.value("metres"), timeout)
+        name, policy = self.value("object"), self.value("policy")
+        model = load_object(name)
+        self.policy_name = choose_policy(name) if policy == AUTOMATIC else policy
+        self.policy = create_policy(self.policy_name, model, **parameters)
+        if timeout > 0:
+            # Ticks, not a deadline: time in which this process could not listen does not count.
+            tick = timeout / _TICKS_PER_TIMEOUT
+            self._timer = self.wall_timer(tick, partial(self._on_tick, tick))
         self._forget()
 
+    def teardown(self) -> None:
+        """Stop counting."""
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+            self._timer = None
+
     def _forget(self) -> None:
-        self._episode: _Episode | None = None
+        self._episode: EpisodeState | None = None
         self._latest: tuple[int, SceneObjects, np.ndarray] | None = None
         self._published: list = []
-        self._views = StampSynchronizer(["objects", "objects/unexplained", "camera/pose"], self._on_view)
+        self._views.reset()
 
-    def _declare_views(self) -> tuple[ViewSphere, np.ndarray]:
+    def awaited(self) -> Awaited | None:
+        """The next view; nothing after the end of an episode."""
+        return None if self._episode is not None and self._episode.ended else self._views.awaited()
+
+    def _declare_views(self) -> None:
         """The grid of views and which of them the robot can reach."""
-        radius = self.declare("radius", 0.8, "of the hemisphere of views, metres", minimum=0.01)
-        elevations = self.declare("elevations_degrees", [15.0, 30.0, 45.0, 60.0, 75.0], "levels of the grid")
-        azimuths = self.declare("azimuths", 20, "views per level, evenly spaced from world +x", minimum=1, maximum=3600)
-        low = self.declare("reach_elevation_min_degrees", 0.0, "lowest view in reach", minimum=0.0, maximum=90.0)
-        high = self.declare("reach_elevation_max_degrees", 90.0, "highest view in reach", minimum=0.0, maximum=90.0)
-        centre = self.declare("reach_azimuth_degrees", 0.0, "middle of the sector in reach, from world +x")
-        width = self.declare("reach_sector_degrees", 360.0, "width of the sector in reach", minimum=0.0, maximum=360.0)
-        views = self.declare("reach_views", [-1], "numbers of the views in reach, -1 for all of the sector")
-        sphere = ViewSphere(radius, tuple(elevations), azimuths)
+        self.declare("radius", 0.8, "radius of the hemisphere of views in metres", minimum=0.01)
+        self.declare("elevations_degrees", [15.0, 30.0, 45.0, 60.0, 75.0], "elevations of the grid of views in degrees")
+        self.declare(
+            "azimuths", 20, "views per elevation, evenly spaced from the world's +x axis", minimum=1, maximum=3600
+        )
+        self.declare(
+            "reach_elevation_min_degrees", 0.0, "lowest reachable elevation in degrees", minimum=0.0, maximum=90.0
+        )
+        self.declare(
+            "reach_elevation_max_degrees", 90.0, "highest reachable elevation in degrees", minimum=0.0, maximum=90.0
+        )
+        self.declare("reach_azimuth_degrees", 0.0, "middle of the reachable sector in degrees from the world's +x axis")
+        self.declare(
+            "reach_sector_degrees", 360.0, "width of the reachable sector in degrees", minimum=0.0, maximum=360.0
+        )
+        self.declare("reach_views", [-1], "numbers of the reachable views, [-1]: all views of the sector")
+
+    def _read_views(self) -> tuple[ViewSphere, np.ndarray]:
+        """The grid of views and (M,) bool, those of them that the robot can reach."""
+        low, high = self.value("reach_elevation_min_degrees"), self.value("reach_elevation_max_degrees")
+        centre, width = self.value("reach_azimuth_degrees"), self.value("reach_sector_degrees")
+        views = self.value("reach_views")
+        sphere = ViewSphere(self.value("radius"), tuple(self.value("elevations_degrees")), self.value("azimuths"))
         azimuth, elevation = np.degrees(sphere.angles(sphere.positions)).T
         allowed = (elevation >= low - 1e-6) & (elevation <= high + 1e-6)
         allowed &= np.abs(np.mod(azimuth - centre + 180.0, 360.0) - 180.0) <= width / 2 + 1e-6
@@ -112,16 +151,17 @@ class AttentionPolicyNode(GraphNode):
         start = stamp_to_ns(message.header.stamp)
         if self._episode is not None and start <= self._episode.start:
             return
-        positions = {} if self._episode is None else self._episode.positions
-        self._begin_episode(start)
         # The first view may have overtaken the announcement of its episode.
-        self._episode.positions = {stamp: position for stamp, position in positions.items() if stamp >= start}
+        views = {} if self._episode is None else self._episode.views_since(start)
+        self._begin_episode(start)
+        for stamp, position in views.items():
+            self._episode.add_view(stamp, position)
         if self._latest is not None and self._latest[0] >= start:
-            self._decide(*self._latest)
+            self._decide()
 
     def _begin_episode(self, start: int) -> None:
-        self._episode = _Episode(start)
-        self.policy.reset(np.random.default_rng([self.seed, start]))
+        self._episode = EpisodeState(start, self._limits)
+        self.policy.reset(np.random.default_rng([self.value("seed"), start]))
 
     def _on_objects(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
@@ -136,13 +176,7 @@ class AttentionPolicyNode(GraphNode):
         stamp = stamp_to_ns(message.header.stamp)
         points = points_from_cloud(message, self.world_frame)
         if not self._is_latest(stamp):
-            self._views.add("objects/unexplained", stamp, points)
-
-    def _on_pose(self, message: PoseStamped) -> None:
-        stamp = stamp_to_ns(message.header.stamp)
-        T_world_camera = pose_stamped_to_transform(message, self.world_frame)
-        if not self._is_latest(stamp):
-            self._views.add("camera/pose", stamp, T_world_camera[:3, 3])
+            self._views.add("unexplained", stamp, points)
 
     def _is_latest(self, stamp: int) -> bool:
         return self._latest is not None and stamp == self._latest[0]
@@ -151,51 +185,66 @@ class AttentionPolicyNode(GraphNode):
         if self._episode is None:
             self._begin_episode(stamp)
         if stamp < self._episode.start:
-            raise MessageError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
-        self._latest = (stamp, view["objects"], view["objects/unexplained"])
-        self._episode.positions[stamp] = view["camera/pose"]
+            raise OutdatedError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
+        self._latest = (stamp, view["objects"], view["unexplained"])
+        self._episode.add_view(stamp, view["pose"][:3, 3])
         self._published = []
         if not self._episode.ended:
-            with self.measure(stamp):
-                self._decide(*self._latest)
+            with self.measure(stamp) as summary:
+                self._decide()
+                summary.append(f"{len(view['objects'])} objects, {len(self._episode.positions)} views so far")
 
-    def _decide(self, stamp: int, objects: SceneObjects, unexplained: np.ndarray) -> None:
-        positions = np.stack(list(self._episode.positions.values()))
-        travelled = self.sphere.path_length(positions)
-        steps_left = self.steps - (len(positions) - 1)
-        if steps_left <= 0:
-            self._finish(stamp, f"budget of {self.steps} moves spent", positions, travelled)
+    def _on_status(self, message: DiagnosticArray) -> None:
+        status = goal_status_from_message(message)
+        if not self._is_latest(status.stamp):
             return
-        metres_left = self.metres - travelled if self.metres > 0 else np.inf
-        observation = Observation(
-            objects, positions, self.sphere, self.allowed, steps_left, metres_left, unexplained=unexplained
-        )
-        decision = self.policy.decide(observation)
-        self._publish_attention(stamp, objects, decision)
-        if decision.stop:
-            reason = "policy is content" if observation.candidates().any() else "no reachable view is left"
-            self._finish(stamp, reason, positions, travelled)
-        else:
-            goal = PoseStamped(header=make_header(stamp, self.world_frame))
-            goal.pose = transform_to_pose(self.sphere.pose(decision.position))
-            self._publish(self.goal, goal)
+        if status.state == GoalState.REACHED:
+            self._episode.reached()
+        elif status.state == GoalState.REFUSED and self._episode.refused(status.reason):
+            self.get_logger().info(f"the camera refuses the goal, another view is chosen: {status.reason}")
+            self._decide()
+
+    def _on_tick(self, seconds: float) -> None:
+        if self._latest is None or not self._active:
+            return
+        if self._views.newest > self._latest[0]:  # of a camera that does not answer goals
+            self._episode.reached()
+        if self._episode.wait(seconds):
+            timeout = self.value("goal_timeout")
+            self.get_logger().warning(f"the camera did not reach the goal within {timeout:g} s, another view is chosen")
+            self._decide()
+
+    def _decide(self) -> None:
+        stamp, objects, unexplained = self._latest
+        self._published = []
+        decision, end = self._episode.decide(self.policy, objects, unexplained)
+        if decision is not None:
+            self._publish_attention(stamp, objects, decision)
+        if end:
+            self._finish(stamp, end)
+            return
+        goal = PoseStamped(header=make_header(stamp, self.world_frame))
+        goal.pose = transform_to_pose(self._limits.sphere.pose(decision.position))
+        self._publish(self.goal, goal)
 
     def _publish_attention(self, stamp: int, objects: SceneObjects, decision: Decision) -> None:
         centres = objects.T_world_object[:, :3, 3]
         cloud = attention_to_cloud(centres, decision.attention, decision.attended, stamp, self.world_frame)
         self._publish(self.attention, cloud)
 
-    def _finish(self, stamp: int, reason: str, positions: np.ndarray, travelled: float) -> None:
+    def _finish(self, stamp: int, reason: str) -> None:
         self._episode.ended = True
+        moves, travelled = self._episode.moves, self._episode.travelled
         values = {
             "policy": self.policy_name,
-            "seed": str(self.seed),
-            "moves": str(len(positions) - 1),
+            "seed": str(self.value("seed")),
+            "moves": str(moves),
             "metres": f"{travelled:.6f}",
         }
         status = DiagnosticStatus(level=DiagnosticStatus.OK, name="episode", message=reason, hardware_id="active6d")
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         self._publish(self.end, DiagnosticArray(header=make_header(stamp, self.world_frame), status=[status]))
+        self.get_logger().info(f"episode ended after {moves} moves and {travelled:.2f} m: {reason}")
 
     def _publish(self, publisher, message) -> None:
         publisher.publish(message)

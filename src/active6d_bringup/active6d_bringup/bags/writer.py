@@ -67,6 +67,7 @@ CONTRACT = (
     RecordedTopic("objects/unexplained", "sensor_msgs/msg/PointCloud2", Per.VIEW, latched=True),
     RecordedTopic("attention", "sensor_msgs/msg/PointCloud2", Per.MOVE),
     RecordedTopic("view_goal", "geometry_msgs/msg/PoseStamped", Per.MOVE),
+    RecordedTopic("view_goal/status", "diagnostic_msgs/msg/DiagnosticArray", Per.WHENEVER, latched=True),
     RecordedTopic("episode/end", "diagnostic_msgs/msg/DiagnosticArray", Per.EPISODE, latched=True),
     RecordedTopic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", Per.WHENEVER, depth=100),
 )

@@ -1,4 +1,4 @@
-"""Stands in for the camera: publishes the views of a recorded episode again."""
+"""Node ``bag_player``: publishes the camera's messages of a recorded episode again."""
 
 from collections import defaultdict
 from importlib import import_module
@@ -10,14 +10,17 @@ from sensor_msgs.msg import PointCloud2
 
 from active6d_bringup.bags.reader import BagError, open_bag, topic_names
 from active6d_bringup.bags.writer import CAMERA_TOPICS, CONTRACT, END, stamp_of
+from active6d_core.ros.clock_output import ClockOutput
 from active6d_core.ros.conversions import make_header, stamp_to_ns
-from active6d_core.ros.node import GraphNode, run_node
+from active6d_core.ros.heartbeat import Awaited
+from active6d_core.ros.node import GraphNode
+from active6d_core.ros.runner import run_node
 
 _REPLAYED = (*CAMERA_TOPICS, *(topic for topic in CONTRACT if topic.name in ("episode/start", "ground_truth/poses")))
 
 
 class BagPlayerNode(GraphNode):
-    """Publishes what the camera said, view by view and byte by byte, then ``episode/end``.
+    """Publishes the camera's recorded messages, view by view and byte by byte, then ``episode/end``.
 
     With ``rate`` 0 the next view goes out when ``objects`` of the last one have arrived; otherwise when as much time
     has passed as in the recording, divided by ``rate``.
@@ -25,10 +28,14 @@ class BagPlayerNode(GraphNode):
 
     def __init__(self, **arguments) -> None:
         super().__init__("bag_player", **arguments)
-        self._folder = self.declare("bag", "", "folder of the bag to play")
-        self._rate = self.declare(
-            "rate", 0.0, "speed against the recording's; 0 waits for the objects of each view instead", minimum=0.0
+        self.declare("bag", "", "folder of the bag to play")
+        self.declare(
+            "rate",
+            0.0,
+            "speed relative to the recording; 0: the next view follows when the objects of the last one have arrived",
+            minimum=0.0,
         )
+        self._clock_output = ClockOutput(self)
         self._outputs = {}
         for topic in _REPLAYED:
             package, _, name = topic.type.split("/")
@@ -44,15 +51,22 @@ class BagPlayerNode(GraphNode):
         Raises:
             BagError: it cannot be read, or has no complete view.
         """
-        if not self._folder:
+        folder, self._rate = self.value("bag"), self.value("rate")
+        if not folder:
             raise ValueError("bag_player: parameter 'bag' must name the folder of a bag")
-        self._views, self._received = _read_views(Path(self._folder).expanduser())
+        self._views, self._received = _read_views(Path(folder).expanduser())
         self._stamps = sorted(self._views)
         self._next = 0
 
     def begin(self) -> None:
         """Publish the first view."""
         self._publish_next()
+
+    def awaited(self) -> Awaited | None:
+        """The objects of the last view, unless views follow by time."""
+        if self._rate > 0 or self._next > len(self._stamps):
+            return None
+        return Awaited(("objects",), self._stamps[self._next - 1])
 
     def teardown(self) -> None:
         """Stop playing."""
@@ -71,11 +85,13 @@ class BagPlayerNode(GraphNode):
             status = DiagnosticStatus(level=DiagnosticStatus.OK, name="episode", message="end of the bag")
             self._end.publish(DiagnosticArray(header=make_header(self._stamps[-1], self.world_frame), status=[status]))
             self._next += 1
+            self.get_logger().info("episode ended: end of the bag")
             return
         if self._next > len(self._stamps):
             return
         stamp = self._stamps[self._next]
         with self.measure(stamp):
+            self._clock_output.set(stamp)
             for topic, payload in self._views[stamp].items():
                 self._outputs[topic].publish(payload)
         self._next += 1

@@ -1,4 +1,4 @@
-"""Records every topic of the graph into a rosbag2 folder, as the serialized messages that went over the wire."""
+"""Node ``episode_recorder``: records every topic of the graph into a rosbag2 folder, message by message as sent."""
 
 import signal
 from functools import partial
@@ -10,7 +10,8 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from active6d_bringup.bags.writer import CONTRACT, END, EpisodeWriter, RecordedTopic, describe_missing
-from active6d_core.ros.node import GraphNode, run_node
+from active6d_core.ros.node import GraphNode
+from active6d_core.ros.runner import run_node
 
 
 class EpisodeRecorderNode(GraphNode):
@@ -22,11 +23,11 @@ class EpisodeRecorderNode(GraphNode):
 
     def __init__(self, **arguments) -> None:
         super().__init__("episode_recorder", **arguments)
-        self._folder = self.declare("bag", "", "folder to create for the bag")
-        self._latched_camera = self.declare(
-            "latched_camera", True, "the camera keeps its last view (transient-local); false for drivers that do not"
+        self.declare("bag", "", "folder to create for the bag")
+        self.declare(
+            "latched_camera", True, "camera topics are transient local; false for plain camera drivers", fixed=True
         )
-        self._settings = self.declare("settings", "{}", "what the other nodes were told, JSON, kept in metadata.yaml")
+        self.declare("settings", "{}", "parameters of the other nodes as JSON, kept in metadata.yaml for replay")
         self._writer: EpisodeWriter | None = None
         self._subscriptions_by_topic = {topic.name: self._subscribe(topic) for topic in CONTRACT}
         self.create_service(Trigger, "~/complete", self._answer_complete)
@@ -38,10 +39,11 @@ class EpisodeRecorderNode(GraphNode):
             ValueError: no folder is named.
             RecordingError: the folder exists, or cannot be made.
         """
+        self._folder = self.value("bag")
         if not self._folder:
             raise ValueError("episode_recorder: parameter 'bag' must name a folder to create")
         names = {topic: subscription.topic_name for topic, subscription in self._subscriptions_by_topic.items()}
-        self._writer = EpisodeWriter(Path(self._folder).expanduser(), names, self._settings)
+        self._writer = EpisodeWriter(Path(self._folder).expanduser(), names, self.value("settings"))
         self.get_logger().info(f"recording into {self._folder}")
 
     def teardown(self) -> None:
@@ -69,7 +71,7 @@ class EpisodeRecorderNode(GraphNode):
         return self._writer.missing(stamp)
 
     def _subscribe(self, topic: RecordedTopic) -> Subscription:
-        from_driver = topic.name.startswith("camera/") and not self._latched_camera
+        from_driver = topic.name.startswith("camera/") and not self.value("latched_camera")
         latched = topic.latched and not from_driver
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_ALL,
@@ -85,7 +87,7 @@ class EpisodeRecorderNode(GraphNode):
             self._writer.write(topic, payload, self.get_clock().now().nanoseconds)
 
     def _answer_complete(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Whether the last episode that has ended is on record in full."""
+        """Whether the last episode that has ended is recorded completely."""
         if self._writer is None:
             response.message = "not recording"
             return response

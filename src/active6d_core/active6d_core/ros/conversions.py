@@ -54,6 +54,10 @@ class MessageError(ValueError):
     """A message that cannot be used; the text says which field and why."""
 
 
+class OutdatedError(MessageError):
+    """A message of a view that is over: a restarted node repeats its last messages, which is no fault."""
+
+
 def stamp_to_ns(stamp: Time) -> int:
     """A message's stamp in nanoseconds."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

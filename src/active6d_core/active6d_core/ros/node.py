@@ -1,45 +1,41 @@
-"""What every node shares: lifecycle, checked parameters, guarded inputs, diagnostics, matching of stamps."""
+"""What every node shares: lifecycle, checked parameters, guarded inputs and diagnostics."""
 
 import json
-import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from functools import partial
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from rclpy.utilities import remove_ros_args
+from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from active6d_core.ros.conversions import HARDWARE_ID, MessageError, ns_to_stamp
+from active6d_core.ros.conversions import HARDWARE_ID, MessageError, OutdatedError, ns_to_stamp
+from active6d_core.ros.heartbeat import Awaited, Watch
+from active6d_core.ros.parameters import ParameterNode
 
 # Both ends: a reliable writer forgets what its queue cannot hold, received by everybody or not.
 _QUEUE_DEPTH = 10
 _LOG_PERIOD_SECONDS = 5.0
-_WAKE_SECONDS = 1.0
 
 
-class GraphNode(LifecycleNode):
-    """A lifecycle node that survives bad input and says how it is doing.
+class GraphNode(ParameterNode):
+    """A lifecycle node that survives bad input and publishes diagnostics.
 
-    Subclasses declare parameters and create inputs and outputs in ``__init__``, do what is heavy in :meth:`setup`, and
-    start their work in :meth:`begin`. What comes while the node is not active is ignored, but for the last messages of
-    latched inputs: the node gets them when it is activated, as if it had come late.
+    Subclasses declare parameters and create inputs and outputs in ``__init__``. They read parameters with
+    :meth:`value` and do what is heavy in :meth:`setup`, and start their work in :meth:`begin`. Input is ignored while
+    the node is not active. Only the last messages of transient local topics are kept and taken on activation.
 
     Raises:
         ValueError: a parameter is out of its range or of another type; the message names it.
@@ -53,8 +49,7 @@ class GraphNode(LifecycleNode):
         namespace: str = "",
         overrides: dict[str, Any] | None = None,
     ) -> None:
-        parameters = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
-        super().__init__(name, context=context, namespace=namespace, parameter_overrides=parameters)
+        super().__init__(name, context=context, namespace=namespace, overrides=overrides)
         self._active = False
         self._starting = False
         self._held: list[tuple[Callable[[Any], None], deque]] = []
@@ -62,18 +57,24 @@ class GraphNode(LifecycleNode):
         self._views_measured = 0
         self._rejected = 0
         self._last_view_at: float | None = None
+        self._last_cause = ""
+        self._watch = Watch(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 100)
         self.create_service(Trigger, "~/connections", self._answer_connections)
-        self.autostart = self.declare("autostart", True, "configure and activate the node by itself when it starts")
-        self.world_frame = self.declare("world_frame", "world", "frame of the bin: origin at its centre, z up")
-        self.camera_frame = self.declare(
-            "camera_frame", "camera_optical_frame", "optical frame of the camera (REP-103)"
+        self.declare("autostart", True, "configure and activate the node automatically when it starts", fixed=True)
+        self.declare("world_frame", "world", "frame of the bin: origin at its centre, z up")
+        self.declare("camera_frame", "camera_optical_frame", "optical frame of the camera (REP-103)")
+        self.declare(
+            "heartbeat", 1.0, "seconds between two heartbeats on /diagnostics, 0 for none", minimum=0.0, fixed=True
         )
+        self._read_frames()
+        if self.value("heartbeat") > 0:
+            self.wall_timer(self.value("heartbeat"), self.beat)
 
     # What a subclass overrides
 
     def setup(self) -> None:
-        """Heavy start-up: load models, drop scenes. Runs on configure."""
+        """Heavy start-up: read parameters, load models, simulate scenes. Runs on configure."""
 
     def begin(self) -> None:
         """First work of an active node. Runs on activate."""
@@ -81,38 +82,21 @@ class GraphNode(LifecycleNode):
     def teardown(self) -> None:
         """Release what :meth:`setup` made. Runs on cleanup and shutdown."""
 
-    # Parameters, inputs and outputs
+    def awaited(self) -> Awaited | None:
+        """What the active node waits for now; None when there is nothing left to do."""
+        return None
 
-    def declare(
-        self,
-        name: str,
-        default: Any,
-        description: str,
-        *,
-        minimum: float | None = None,
-        maximum: float | None = None,
-        choices: Sequence[str] | None = None,
-    ) -> Any:
-        """Declare a read-only parameter and return its checked value."""
-        limits = [f">= {minimum}"] * (minimum is not None) + [f"<= {maximum}"] * (maximum is not None)
-        if choices is not None:
-            limits.append("one of " + ", ".join(choices))
-        descriptor = ParameterDescriptor(
-            description=description, additional_constraints="; ".join(limits), read_only=True
-        )
-        try:
-            value = self.declare_parameter(name, default, descriptor).value
-        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            expected = f"a {type(default).__name__} such as {default!r}"
-            raise ValueError(f"{self.get_name()}: parameter '{name}' must be {expected} ({error})") from error
-        low = minimum is not None and not value >= minimum
-        high = maximum is not None and not value <= maximum
-        if low or high or (choices is not None and value not in choices):
-            raise ValueError(f"{self.get_name()}: parameter '{name}' is {value!r}, must be {' and '.join(limits)}")
-        return value
+    # Inputs and outputs
+
+    def _read_frames(self) -> None:
+        self.world_frame, self.camera_frame = self.value("world_frame"), self.value("camera_frame")
+
+    def wall_timer(self, seconds: float, callback: Callable[[], None]) -> Timer:
+        """A timer on a clock that no simulation sets; it is for watching, results must not depend on it."""
+        return self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def output(self, message_type: type, topic: str, latched: bool = False) -> Publisher:
-        """A reliable publisher; ``latched`` keeps its last messages for those who come later (transient-local)."""
+        """A reliable publisher; ``latched`` makes it transient local, so that late-joining subscribers get messages."""
         return self.create_lifecycle_publisher(
             message_type, topic, _qos(latched, depth=_QUEUE_DEPTH), qos_overriding_options=_overridable()
         )
@@ -120,13 +104,13 @@ class GraphNode(LifecycleNode):
     def input(
         self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool = False
     ) -> Subscription:
-        """A reliable subscription whose callback may raise :class:`MessageError`: that message is refused, no more."""
+        """A reliable subscription; a message for which the callback raises :class:`MessageError` is refused."""
         return self._subscribe(message_type, topic, callback, _qos(latched, depth=_QUEUE_DEPTH))
 
     def camera_input(
         self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool
     ) -> Subscription:
-        """An :meth:`input` from a camera: latched as this project's are, else best effort, which suits all drivers."""
+        """An :meth:`input` from a camera: transient local as this project's, else best effort as suits all drivers."""
         qos = _qos(latched, depth=_QUEUE_DEPTH)
         if not latched:
             qos.reliability = ReliabilityPolicy.BEST_EFFORT
@@ -142,34 +126,87 @@ class GraphNode(LifecycleNode):
             if not self._active:
                 held.append(message)
                 return
-            try:
-                callback(message)
-            except MessageError as error:
-                self.reject(f"{topic}: {error}")
+            self.guard(topic, partial(callback, message))
+
+        def incompatible(event: Any) -> None:
+            self.get_logger().warning(self._watch.mismatch(topic, event.last_policy_kind))
 
         self._held.append((guarded, held))
-        return self.create_subscription(message_type, topic, guarded, qos, qos_overriding_options=_overridable())
+        return self.create_subscription(
+            message_type,
+            topic,
+            guarded,
+            qos,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
+            qos_overriding_options=_overridable(),
+        )
+
+    def guard(self, topic: str, action: Callable[[], None]) -> None:
+        """Do what input on a topic causes; a :class:`MessageError` is reported and nothing else."""
+        try:
+            action()
+        except OutdatedError as error:
+            self._ignore(f"{topic}: {error}")
+        except MessageError as error:
+            self.reject(f"{topic}: {error}")
 
     # Diagnostics
 
     def reject(self, reason: str) -> None:
-        """Log a refused message (throttled) and tell /diagnostics."""
+        """Log a refused message (throttled) and publish it on /diagnostics."""
         self._rejected += 1
         self.get_logger().error(reason, throttle_duration_sec=_LOG_PERIOD_SECONDS)
         self._diagnose(DiagnosticStatus.ERROR, reason, 0, {})
 
+    def _ignore(self, reason: str) -> None:
+        """Drop a message of a view that is over: a neighbour that was restarted repeats its last messages."""
+        self.get_logger().info(f"ignored {reason}", throttle_duration_sec=_LOG_PERIOD_SECONDS)
+        self._watch.outdated(reason)
+        self._diagnose(DiagnosticStatus.OK, f"ignored {reason}", 0, {})
+
     @contextmanager
-    def measure(self, stamp: int) -> Iterator[None]:
-        """Time the work on the view with this stamp and publish latency and rate on /diagnostics."""
+    def measure(self, stamp: int) -> Iterator[list[str]]:
+        """Time the work on the view with this stamp: latency and rate go to /diagnostics, one line to the log.
+
+        What the block appends to the list it gets, such as "8 hypotheses", is in that line.
+        """
+        summary: list[str] = []
         started = time.perf_counter()
-        yield
+        yield summary
         finished = time.perf_counter()
         self._views_measured += 1
-        values = {"latency_ms": f"{(finished - started) * 1e3:.3f}"}
+        latency_ms = (finished - started) * 1e3
+        values = {"latency_ms": f"{latency_ms:.3f}"}
         if self._last_view_at is not None:
             values["rate_hz"] = f"{1.0 / max(finished - self._last_view_at, 1e-9):.3f}"
         self._last_view_at = finished
         self._diagnose(DiagnosticStatus.OK, "view processed", stamp, values)
+        self.get_logger().info(
+            ": ".join([f"view of {stamp * 1e-9:.3f} s", ", ".join([*summary, f"{latency_ms:.0f} ms"])])
+        )
+
+    def beat(self) -> None:
+        """Publish what the node waits for, since when and, after some seconds, why. It changes nothing else."""
+        now = self.get_clock().now().nanoseconds
+        if not self._active:
+            self._watch.update(None)
+            state = "inactive" if self._configured else "unconfigured"
+            self._diagnose(DiagnosticStatus.OK, f"{state}, waiting for a lifecycle transition", now, {})
+            return
+        awaited = self.awaited()
+        seconds, cause = self._watch.update(awaited), self._watch.cause()
+        if awaited is None:
+            self._diagnose(DiagnosticStatus.OK, "ready", now, {})
+            return
+        text = f"waiting for {awaited} for {seconds:.0f} s"
+        if cause:
+            text += f": {cause}"
+            if cause != self._last_cause:
+                self.get_logger().warning(text)
+        self._last_cause = cause
+        topics = ",".join(self.resolve_topic_name(topic) for topic in awaited.topics)
+        values = {"waiting_for": topics, "waiting_s": f"{seconds:.0f}"}
+        self._diagnose(DiagnosticStatus.WARN if cause else DiagnosticStatus.OK, text, now, values)
 
     def _diagnose(self, level: bytes, message: str, stamp: int, values: dict[str, str]) -> None:
         values = {**values, "views": str(self._views_measured), "rejected": str(self._rejected)}
@@ -203,13 +240,18 @@ class GraphNode(LifecycleNode):
             self._starting = False
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run :meth:`setup`."""
-        return self._attempt(self.setup)
+        """Run :meth:`setup` with the parameters as they are now."""
+        self._configured = True
+        self._read_frames()
+        result = self._attempt(self.setup)
+        self._configured = result == TransitionCallbackReturn.SUCCESS
+        return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open the outputs, run :meth:`begin`, then take what latched inputs brought before."""
+        """Open the outputs, run :meth:`begin`, then take what transient local inputs brought before."""
         super().on_activate(state)
         self._active = True
+        self.get_logger().info("ready")
         result = self._attempt(self.begin)
         if result == TransitionCallbackReturn.SUCCESS:
             result = self._attempt(self._take_held)
@@ -229,6 +271,7 @@ class GraphNode(LifecycleNode):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run :meth:`teardown`."""
+        self._configured = False
         return self._attempt(self.teardown)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -289,14 +332,13 @@ class StampSynchronizer:
         """Take a value; a second one for an incomplete stamp replaces the first (its sender was restarted).
 
         Raises:
-            MessageError: the stamp was completed already, or is older than the last complete one; or, with the value
-                taken, an older incomplete set had to make room.
+            OutdatedError: the stamp was completed already, or is older than the last complete one.
+            MessageError: the value is taken, but an older incomplete set had to make room.
         """
         if stamp <= self._last_complete:
             kind = "duplicate" if stamp == self._last_complete else "stale"
-            raise MessageError(
-                f"{kind} stamp {stamp * 1e-9:.3f} s of {name}, already at {self._last_complete * 1e-9:.3f} s; "
-                "a camera whose stamps begin anew needs the other nodes started anew, too"
+            raise OutdatedError(
+                f"{kind} stamp {stamp * 1e-9:.3f} s of {name}, already at {self._last_complete * 1e-9:.3f} s"
             )
         self._pending.setdefault(stamp, {})[name] = value
         if self._pending[stamp].keys() == self._names:
@@ -312,53 +354,6 @@ class StampSynchronizer:
     def missing(self) -> dict[int, set[str]]:
         """Names still awaited, per incomplete stamp."""
         return {stamp: set(self._names - values.keys()) for stamp, values in self._pending.items()}
-
-
-def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> None:
-    """The main function of every executable: spin one node until interrupted. Exit code 2 on bad arguments."""
-    _refuse_words(list(sys.argv if args is None else args))
-    rclpy.init(args=args)
-    node = None
-    try:
-        try:
-            node = node_type()
-            if node.autostart:
-                node.start()
-        # Only here: a ValueError in a callback is a defect, which needs its traceback and the supervisor's restart.
-        except ValueError as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(2)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        # Not spin(): on an interrupt rclpy wakes the executor a moment before it ends the context, and one that waits
-        # again in that moment would sleep until the next message.
-        while rclpy.ok():
-            executor.spin_once(timeout_sec=_WAKE_SECONDS)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except RuntimeError:
-        # An interrupt between the executor's look at the context and its wait ends in rcl's own error.
-        if rclpy.ok():
-            raise
-    finally:
-        # A terminal and `ros2 launch` both interrupt their children: the second must not tear the clean-up.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-
-
-def _refuse_words(arguments: list[str]) -> None:
-    """End with usage, or with an error: rclpy would drop silently what stands before ``--ros-args``."""
-    words = remove_ros_args(arguments)[1:]
-    if not words:
-        return
-    usage = f"usage: {Path(arguments[0]).stem} [--ros-args -p NAME:=VALUE ... --params-file FILE]"
-    if set(words) & {"-h", "--help"}:
-        print(f"{usage}\nparameters and topics: docs/graph.md, or `ros2 param describe` while it runs")
-        sys.exit(0)
-    print(f"error: '{words[0]}' is not for a node; parameters come after --ros-args\n{usage}", file=sys.stderr)
-    sys.exit(2)
 
 
 def _qos(latched: bool, depth: int) -> QoSProfile:

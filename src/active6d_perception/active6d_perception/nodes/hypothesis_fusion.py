@@ -1,9 +1,9 @@
-"""Verifies every view's hypotheses against its depth image and fuses them with those of earlier views.
+"""Node ``hypothesis_fusion``: verifies each view's hypotheses against its depth image and fuses them across views.
 
-Also tells what of the surface in the depth images the fused objects do not explain.
+It also publishes the surface in the depth images that the fused objects do not explain.
 """
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from active6d_core.files import atomic_file, cache_folder
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.ros.conversions import (
-    MessageError,
+    OutdatedError,
     hypotheses_from_cloud,
     image_to_segmentation,
     objects_to_cloud,
@@ -27,78 +27,33 @@ from active6d_core.ros.conversions import (
     require_frame,
     stamp_to_ns,
 )
-from active6d_core.ros.node import GraphNode, run_node
+from active6d_core.ros.heartbeat import Awaited
+from active6d_core.ros.node import GraphNode
 from active6d_core.ros.optional_outputs import DetectionOutput
+from active6d_core.ros.runner import run_node
 from active6d_core.ros.view_inputs import ViewInputs
 from active6d_perception.scene.fusion import RANKINGS, FusionParameters, SceneFusion
 from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
 from active6d_perception.scene.verification import Verifier
 
+#: What belongs to a view beside the camera's topics, part to topic.
+_OTHERS = {"hypotheses": "hypotheses", "segmentation": "hypotheses/segmentation"}
+
 
 class HypothesisFusionNode(GraphNode):
-    """Hypotheses with masks, depth and camera pose in; ``objects``, ``objects/poses``, ``objects/markers`` and
-    ``objects/unexplained`` out.
+    """Subscribes to hypotheses with label images, depth and the camera's pose; publishes ``objects``,
+    ``objects/poses``, ``objects/markers`` and ``objects/unexplained``.
 
-    Where vision_msgs is installed, the objects also go out as ``objects/detections``.
+    Where vision_msgs is installed, it also publishes the objects as ``objects/detections``.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("hypothesis_fusion", **options)
-        self._object = self.declare("object", "mug", "name of the object that the hypotheses are of")
-        self._epsilon = self.declare("epsilon", 0.010, "threshold of the verification score, metres", minimum=1e-4)
-        self._samples = self.declare("samples", 128, "most scene points verified per hypothesis", minimum=1)
-        self._fusion_parameters = FusionParameters(
-            cut=self.declare(
-                "cut", FusionParameters.cut, "clusters are cut at this fraction of the diameter", minimum=1e-3
-            ),
-            exclusion=self.declare(
-                "exclusion",
-                FusionParameters.exclusion,
-                "two objects are at least this fraction of the diameter apart",
-                minimum=0.0,
-            ),
-            min_verification=self.declare(
-                "min_verification",
-                FusionParameters.min_verification,
-                "hypotheses verified worse are ignored",
-                minimum=-1.0,
-                maximum=1.0,
-            ),
-            rank_by=self.declare(
-                "rank_by",
-                FusionParameters.rank_by,
-                "what makes hypotheses and clusters the best: equation 1, the estimator's score, both, or their sum",
-                choices=RANKINGS,
-            ),
-            explained_within=self.declare(
-                "explained_within",
-                FusionParameters.explained_within,
-                "surface this near to an object is that object's, as a fraction of the diameter; with less, poses that "
-                "are a little off leave surface of found objects unexplained",
-                minimum=1e-3,
-                maximum=1.0,
-            ),
-        )
-        self._workspace = {
-            "width": self.declare(
-                "workspace_width",
-                [0.0, 0.0],
-                "sides, along world x and y about the origin, of the box in which unexplained surface is looked for, "
-                "metres; walls should be outside; 0 for those of the object's usual bin less a margin",
-            ),
-            "floor": self.declare(
-                "workspace_floor",
-                0.0,
-                "lower end of the box in which unexplained surface is looked for, world z in metres; the bin's floor "
-                "should be below; 0 for 5 % of the diameter",
-            ),
-            "height": self.declare(
-                "workspace_height",
-                0.0,
-                "upper end of that box, world z in metres; 0 for one and a half diameters",
-                minimum=0.0,
-            ),
-        }
+        self.declare("object", "mug", "name of the object that the hypotheses are of")
+        self.declare("epsilon", 0.010, "depth threshold of the verification score in metres", minimum=1e-4)
+        self.declare("samples", 128, "largest number of scene points verified per hypothesis", minimum=1)
+        self._declare_fusion()
+        self._declare_workspace()
         self._objects = self.output(PointCloud2, "objects", latched=True)
         self._poses = self.output(PoseArray, "objects/poses", latched=True)
         self._markers = self.output(MarkerArray, "objects/markers", latched=True)
@@ -108,17 +63,70 @@ class HypothesisFusionNode(GraphNode):
         self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
         self.input(PointCloud2, "hypotheses", self._on_hypotheses, latched=True)
         self.input(Image, "hypotheses/segmentation", self._on_segmentation, latched=True)
-        self._inputs = ViewInputs(self, ("depth", "camera", "pose"), self._on_view, ("hypotheses", "segmentation"))
+        self._inputs = ViewInputs(self, ("depth", "camera", "pose"), self._on_view, _OTHERS)
+
+    def _declare_fusion(self) -> None:
+        usual = FusionParameters()
+        self.declare(
+            "cut", usual.cut, "distance at which clusters are cut, as a fraction of the object's diameter", minimum=1e-3
+        )
+        self.declare(
+            "exclusion",
+            usual.exclusion,
+            "least distance between two objects, as a fraction of the diameter",
+            minimum=0.0,
+        )
+        self.declare(
+            "min_verification",
+            usual.min_verification,
+            "hypotheses with a lower verification score are ignored",
+            minimum=-1.0,
+            maximum=1.0,
+        )
+        self.declare(
+            "rank_by",
+            usual.rank_by,
+            "how hypotheses and clusters are ranked: verification score, estimator score, product, summed evidence",
+            choices=RANKINGS,
+        )
+        self.declare(
+            "explained_within",
+            usual.explained_within,
+            "observed surface this near to an object is explained by it, as a fraction of the diameter; a smaller "
+            "value leaves surface of found objects unexplained where poses are slightly off",
+            minimum=1e-3,
+            maximum=1.0,
+        )
+
+    def _declare_workspace(self) -> None:
+        self.declare(
+            "workspace_width",
+            [0.0, 0.0],
+            "sides along world x and y, in metres, of the box in which unexplained surface is looked for; it is "
+            "centred on the origin and walls should be outside; 0: the object's usual bin less a margin",
+        )
+        self.declare(
+            "workspace_floor",
+            0.0,
+            "lower end of that box, world z in metres; the bin's floor should be below; 0: 5 % of the diameter",
+        )
+        self.declare(
+            "workspace_height",
+            0.0,
+            "upper end of that box, world z in metres; 0: one and a half diameters",
+            minimum=0.0,
+        )
 
     def setup(self) -> None:
         """Load the object and precompute its views; nothing is known of any view."""
         self._latest: tuple[int, np.ndarray, PinholeCamera] | None = None
         self._episode_start = 0
         self._inputs.reset()
-        self._model = load_object(self._object)
-        self._verifier = Verifier(self._model, self._epsilon, self._samples)
-        self._fusion = SceneFusion(self._model, self._fusion_parameters)
-        self._surface = ObservedSurface(self._model, self._make_grid(), self._fusion_parameters.explained_within)
+        self._model = load_object(self.value("object"))
+        parameters = FusionParameters(**{each.name: self.value(each.name) for each in fields(FusionParameters)})
+        self._verifier = Verifier(self._model, self.value("epsilon"), self.value("samples"))
+        self._fusion = SceneFusion(self._model, parameters)
+        self._surface = ObservedSurface(self._model, self._make_grid(), parameters.explained_within)
         try:
             self._mesh_uri = export_mesh(self._model)
         except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
@@ -127,17 +135,22 @@ class HypothesisFusionNode(GraphNode):
 
     def _make_grid(self) -> SurfaceGrid:
         usual = SurfaceGrid.for_model(self._model)
-        sides = zip(self._workspace["width"], usual.width, strict=False)
-        given = {name: value for name, value in self._workspace.items() if name != "width" and value != 0}
+        sides = zip(self.value("workspace_width"), usual.width, strict=False)
+        given = {name: self.value(f"workspace_{name}") for name in ("floor", "height")}
+        given = {name: value for name, value in given.items() if value != 0}
         try:
             return replace(usual, width=tuple(side or own for side, own in sides), **given)
         except ValueError as error:
             raise ValueError(f"{self.get_name()}: parameters 'workspace_*': {error}") from error
 
+    def awaited(self) -> Awaited:
+        """The estimator's and the camera's topics."""
+        return self._inputs.awaited()
+
     def _on_hypotheses(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
         if self._is_latest(stamp):
-            self._publish()  # a restarted estimator repeats its last view; whoever awaits the result gets it again
+            self._publish()  # a restarted estimator repeats its last view: repeat the result for its subscribers
         else:
             self._inputs.add("hypotheses", stamp, message)
 
@@ -155,20 +168,22 @@ class HypothesisFusionNode(GraphNode):
             self._publish()  # the first view overtook the announcement of its episode
 
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
-        if stamp < self._episode_start:  # the estimator was still at it when the scene changed
-            raise MessageError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
+        if stamp < self._episode_start:  # the estimator was still busy with it when the scene changed
+            raise OutdatedError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
         hypotheses = hypotheses_from_cloud(values["hypotheses"], values["segmentation"], self.camera_frame)
-        with self.measure(stamp):
+        with self.measure(stamp) as summary:
             verification = self._verifier.score(values["depth"], values["camera"], hypotheses)
             self._fusion.add_view(stamp, values["pose"], hypotheses, verification)
             self._surface.add_view(stamp, values["depth"], values["camera"], values["pose"])
             self._latest = stamp, values["pose"], values["camera"]
-            self._publish()
+            count = self._publish()
+            summary.append(f"{len(hypotheses)} hypotheses, {count} objects")
 
     def _is_latest(self, stamp: int) -> bool:
         return self._latest is not None and stamp == self._latest[0]
 
-    def _publish(self) -> None:
+    def _publish(self) -> int:
+        """Publish the objects after the latest view; how many there are."""
         stamp = self._latest[0]
         objects = self._fusion.objects(*self._latest)
         self._objects.publish(objects_to_cloud(objects, stamp, self.world_frame))
@@ -178,6 +193,7 @@ class HypothesisFusionNode(GraphNode):
         unexplained = self._surface.unexplained(objects.T_world_object)
         self._unexplained.publish(points_to_cloud(unexplained, stamp, self.world_frame))
         self._detections.publish(objects, self._model, stamp, self.world_frame)
+        return len(objects)
 
 
 def export_mesh(model: ObjectModel) -> str:

@@ -1,4 +1,4 @@
-"""An RGB-D camera above a simulated heap: a goal moves it, and every move is one view on the camera's topics."""
+"""Node ``camera_simulator``: an RGB-D camera above a simulated pile of objects."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from active6d_core.camera import PinholeCamera, View
-from active6d_core.ros.node import run_node
+from active6d_core.ros.runner import run_node
 from active6d_sim.nodes.moving_camera import MovingCameraNode
 from active6d_sim.rendering.sensor import SensorNoise
 from active6d_sim.rendering.simulator import Simulator, admit_goal
@@ -14,27 +14,27 @@ from active6d_sim.scenes.scene_store import SPLITS, find_scene
 
 
 class CameraSimulatorNode(MovingCameraNode):
-    """A moving camera in a stored scene or in a heap dropped by seed; ``~/next_scene`` goes on to the next one."""
+    """A moving camera in a stored scene or in a simulated pile; ``~/next_scene`` goes on to the next one."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("camera_simulator", **options)
-        self._scene_name = self.declare(
-            "scene", "", "a stored scene such as mug/test/3; empty drops a new heap by seed"
-        )
-        self._snap = self.declare("snap_to_grid", True, "go to the grid's view nearest to a goal, not exactly there")
-        noise = self.declare("noise_scale", 1.0, "strength of the sensor's noise; 0 is a perfect sensor", minimum=0.0)
-        self._noise = SensorNoise().scaled(noise)
-        self._camera = PinholeCamera.from_field_of_view(
-            self.declare("width", 640, "of the images, pixels", minimum=16, maximum=4096),
-            self.declare("height", 480, "of the images, pixels", minimum=16, maximum=4096),
-            self.declare("field_of_view", 60.0, "across the image, degrees", minimum=5.0, maximum=150.0),
-        )
-        self.check_start_view(len(self.sphere))
+        self.declare("scene", "", "name of a stored scene such as mug/test/3; empty: a new pile simulated by the seed")
+        self.declare("snap_to_grid", True, "go to the grid's view nearest to a goal instead of exactly to the goal")
+        self.declare("noise_scale", 1.0, "factor on the sensor noise; 0: no noise", minimum=0.0)
+        self.declare("width", 640, "image width in pixels", minimum=16, maximum=4096)
+        self.declare("height", 480, "image height in pixels", minimum=16, maximum=4096)
+        self.declare("field_of_view", 60.0, "horizontal field of view in degrees", minimum=5.0, maximum=150.0)
         self.create_service(Trigger, "~/next_scene", self._on_next_scene)
 
     def setup(self) -> None:
-        """Drop or load the scene."""
-        self._load(self._scene_name, self.seed)
+        """Simulate or load the scene."""
+        super().setup()
+        self.check_start_view(len(self.sphere))
+        self._noise = SensorNoise().scaled(self.value("noise_scale"))
+        self._camera = PinholeCamera.from_field_of_view(
+            self.value("width"), self.value("height"), self.value("field_of_view")
+        )
+        self._load(self.value("scene"), self.seed)
 
     def _load(self, scene_name: str, seed: int) -> None:
         scene = find_scene(self.object_name, scene_name, seed)
@@ -54,24 +54,24 @@ class CameraSimulatorNode(MovingCameraNode):
         return self.sphere.pose(self.sphere.positions[view])
 
     def truth(self, view: int) -> np.ndarray:
-        """The scene's objects that some view shows."""
+        """The scene's objects that are visible in some view."""
         return self._simulator.scene.T_world_object
 
     def destination(self, T_world_goal: np.ndarray) -> np.ndarray:
         """The goal, or the grid's view nearest to it."""
-        return admit_goal(T_world_goal, self.sphere, snap=self._snap, tolerance=self.tolerance)
+        return admit_goal(T_world_goal, self.sphere, snap=self.value("snap_to_grid"), tolerance=self.tolerance)
 
     def capture(self, T_world_camera: np.ndarray, stamp: int) -> View:
         """What the sensor sees from there."""
         return self._simulator.capture(T_world_camera, stamp)
 
     def _on_next_scene(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """A new episode in the next stored scene of the split, or in a heap dropped by the next seed."""
+        """A new episode in the next stored scene of the split, or in a pile simulated by the next seed."""
         return self.restart(response, self._load_next)
 
     def _load_next(self) -> None:
         scene = self._simulator.scene
-        if not self._scene_name:
+        if not self.value("scene"):
             self._load("", scene.seed + 1)
             return
         split, index = scene.name.split("/")[-2:]

@@ -1,4 +1,4 @@
-"""A camera that was there once: a goal moves it to the nearest view of a scene recorded in BOP's format."""
+"""Node ``dataset_camera``: a goal selects the nearest view of a scene recorded in BOP's format."""
 
 from typing import Any
 
@@ -6,27 +6,27 @@ import numpy as np
 
 from active6d_core.camera import View
 from active6d_core.ros.conversions import MessageError
-from active6d_core.ros.node import run_node
+from active6d_core.ros.runner import run_node
 from active6d_sim.datasets.bop import BopScene
 from active6d_sim.nodes.moving_camera import MovingCameraNode
 from active6d_sim.rendering.simulator import admit_goal
 
 
 class DatasetCameraNode(MovingCameraNode):
-    """A moving camera that knows only the recorded views; what it publishes is as recorded, its pose too.
+    """A moving camera restricted to the recorded views; it publishes images and poses as they were recorded.
 
-    Directions are from the recording's world origin, which should be the bin's centre with z up.
+    The recording's world origin should be the bin's centre with z up.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("dataset_camera", **options)
-        self._folder = self.declare("scene", "", "folder of the recorded scene: scene_camera.json, rgb/ and depth/")
-        self._object_id = self.declare(
-            "object_id", 0, "number of the object in the recorded ground truth, 0 for all of them", minimum=0
-        )
+        self.declare("scene", "", "folder of the recorded scene: scene_camera.json, rgb/ and depth/")
+        self.declare("object_id", 0, "number of the object in the recorded ground truth, 0: all objects", minimum=0)
 
     def setup(self) -> None:
         """Read the recording's files, without its images."""
+        super().setup()
+        self._folder = self.value("scene")
         if not self._folder:
             raise ValueError(f"{self.get_name()}: parameter 'scene' must name the folder of a recorded scene")
         self._scene = BopScene.load(self._folder)
@@ -46,8 +46,10 @@ class DatasetCameraNode(MovingCameraNode):
         return self._scene.T_world_camera[view]
 
     def truth(self, view: int) -> np.ndarray | None:
-        """What the recording says of that image's objects."""
-        return self._scene.T_world_object(view, self._object_id or None) if self._scene.truth is not None else None
+        """The objects' poses in that image's ground truth, if the recording has any."""
+        return (
+            self._scene.T_world_object(view, self.value("object_id") or None) if self._scene.truth is not None else None
+        )
 
     def destination(self, T_world_goal: np.ndarray) -> np.ndarray:
         """The recorded view nearest in direction to the goal."""

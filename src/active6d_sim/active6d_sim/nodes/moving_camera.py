@@ -1,4 +1,4 @@
-"""What a simulated and a recorded camera share: a goal moves them, and every move is one view on their topics."""
+"""What a simulated and a recorded camera share: a goal moves them, and every move publishes one view."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -11,8 +11,10 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
 from active6d_core.camera import View
+from active6d_core.ros.clock_output import ClockOutput
 from active6d_core.ros.conversions import (
     MessageError,
+    OutdatedError,
     camera_to_info,
     color_to_image,
     depth_to_image,
@@ -22,6 +24,8 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
+from active6d_core.ros.episode_messages import GoalState, GoalStatus, goal_status_to_message
+from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.optional_outputs import TransformOutput
 from active6d_core.view_sphere import ViewSphere
@@ -29,30 +33,34 @@ from active6d_sim.rendering.simulator import NANOSECONDS, GoalError, arrival
 
 
 class MovingCameraNode(GraphNode):
-    """``view_goal`` in; the camera's topics, ``episode/start`` and, for scoring only, ``ground_truth/poses`` out.
+    """Subscribes to ``view_goal`` and answers each goal on ``view_goal/status``.
 
-    The first view comes by itself. All topics are latched, so that a node that starts late gets the last view.
+    It publishes the camera's topics, ``episode/start`` and, for scoring only, ``ground_truth/poses``. The first view
+    needs no goal. All topics are transient local, so that a node that starts late gets the last view.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self.object_name = self.declare("object", "mug", "name of the object that fills the bin")
-        self.seed = self.declare("seed", 0, "of all that is drawn: a heap, its looks, noise, the first view", minimum=0)
-        self.start_view = self.declare(
-            "start_view", -1, "number of the view to start from, -1 draws it by seed", minimum=-1
+        self.declare("object", "mug", "name of the object that fills the bin")
+        self.declare("seed", 0, "seed of the random generator (pile, appearance, sensor noise, start view)", minimum=0)
+        self.declare("start_view", -1, "number of the view to start from, -1: drawn by the seed", minimum=-1)
+        self.declare(
+            "goal_tolerance",
+            0.05,
+            "largest distance in metres of an accepted goal from the hemisphere of views",
+            minimum=0.0,
         )
-        self.tolerance = self.declare(
-            "goal_tolerance", 0.05, "metres that a goal may be off the hemisphere", minimum=0.0
-        )
-        self._speed = self.declare("camera_speed", 0.25, "metres per second of simulated time", minimum=1e-3)
-        self.sphere = ViewSphere(self.declare("radius", 0.8, "of the hemisphere of views, metres", minimum=0.1))
+        self.declare("camera_speed", 0.25, "speed of the camera in metres per second of simulated time", minimum=1e-3)
+        self.declare("radius", 0.8, "radius of the hemisphere of views in metres", minimum=0.1)
         self._stamp = 0
+        self._clock_output = ClockOutput(self)
         self._color = self.output(Image, "camera/color/image_raw", latched=True)
         self._depth = self.output(Image, "camera/depth/image_raw", latched=True)
         self._info = self.output(CameraInfo, "camera/color/camera_info", latched=True)
         self._pose = self.output(PoseStamped, "camera/pose", latched=True)
         self._truth = self.output(PoseArray, "ground_truth/poses", latched=True)
         self._start = self.output(DiagnosticArray, "episode/start", latched=True)
+        self._status = self.output(DiagnosticArray, "view_goal/status", latched=True)
         self._transforms = TransformOutput(self)
         self.input(PoseStamped, "view_goal", self._on_goal)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -62,7 +70,7 @@ class MovingCameraNode(GraphNode):
     @property
     @abstractmethod
     def scene_name(self) -> str:
-        """Of the scene that is loaded."""
+        """Name of the scene that is loaded."""
 
     @abstractmethod
     def start_pose(self, view: int) -> np.ndarray:
@@ -74,7 +82,7 @@ class MovingCameraNode(GraphNode):
 
     @abstractmethod
     def truth(self, view: int) -> np.ndarray | None:
-        """(n, 4, 4) ``T_world_object`` when an episode begins at the numbered view, None where nobody knows."""
+        """(n, 4, 4) ``T_world_object`` when an episode begins at the numbered view, None where it is not known."""
 
     @abstractmethod
     def destination(self, T_world_goal: np.ndarray) -> np.ndarray:
@@ -94,14 +102,27 @@ class MovingCameraNode(GraphNode):
 
     # Views
 
+    def setup(self) -> None:
+        """Read the parameters."""
+        self.object_name, self.seed = self.value("object"), self.value("seed")
+        self.sphere, self.tolerance = ViewSphere(self.value("radius")), self.value("goal_tolerance")
+        self._speed = self.value("camera_speed")
+
     def check_start_view(self, views: int) -> None:
         """Raise ValueError unless there is a view of the number to start from."""
-        if self.start_view >= views:
-            raise ValueError(f"{self.get_name()}: parameter 'start_view' is {self.start_view}, the last is {views - 1}")
+        start = self.value("start_view")
+        if start >= views:
+            raise ValueError(f"{self.get_name()}: parameter 'start_view' is {start}, the last is {views - 1}")
+
+    def awaited(self) -> Awaited:
+        """The next goal."""
+        return Awaited(("view_goal",))
 
     def begin(self) -> None:
         """Start an episode: announce it and publish its first view."""
-        start = self.draw_start() if self.start_view < 0 else self.start_view
+        start = self.value("start_view")
+        if start < 0:
+            start = self.draw_start()
         stamp = arrival(self._stamp, 0.0, self._speed) if self._stamp else NANOSECONDS
         self._photograph(self.start_pose(start), stamp, start)
 
@@ -110,6 +131,7 @@ class MovingCameraNode(GraphNode):
         with self.measure(stamp):
             view = self.capture(T_world_camera, stamp)
             self._stamp, self._T_world_camera = stamp, T_world_camera
+            self._clock_output.set(stamp)
             if start is not None:
                 self._announce(start)
             self._transforms.publish({self.camera_frame: T_world_camera}, stamp, self.world_frame)
@@ -129,16 +151,29 @@ class MovingCameraNode(GraphNode):
             self._truth.publish(poses_to_array(T_world_object, self._stamp, self.world_frame))
 
     def _on_goal(self, message: PoseStamped) -> None:
+        stamp = stamp_to_ns(message.header.stamp)
+        try:
+            T_world_camera = self._admit(message)
+            self._answer(stamp, GoalState.ACCEPTED)
+            arc = self.sphere.arc(self._T_world_camera[:3, 3], T_world_camera[:3, 3])
+            self._photograph(T_world_camera, arrival(self._stamp, float(arc), self._speed))
+        except MessageError as error:
+            self._answer(stamp, GoalState.REFUSED, str(error))
+            raise
+        self._answer(stamp, GoalState.REACHED)
+
+    def _admit(self, message: PoseStamped) -> np.ndarray:
+        """Where the camera goes for a goal; a goal that was decided on an older view raises OutdatedError."""
         decided_at, now = stamp_to_ns(message.header.stamp), self._stamp
         if 0 < decided_at < now:
-            raise MessageError(f"stale goal, decided at {decided_at * 1e-9:.3f} s, now it is {now * 1e-9:.3f} s")
-        T_world_goal = pose_stamped_to_transform(message, self.world_frame)
+            raise OutdatedError(f"stale goal, decided at {decided_at * 1e-9:.3f} s, now it is {now * 1e-9:.3f} s")
         try:
-            T_world_camera = self.destination(T_world_goal)
+            return self.destination(pose_stamped_to_transform(message, self.world_frame))
         except GoalError as error:
             raise MessageError(str(error)) from error
-        arc = self.sphere.arc(self._T_world_camera[:3, 3], T_world_camera[:3, 3])
-        self._photograph(T_world_camera, arrival(now, float(arc), self._speed))
+
+    def _answer(self, stamp: int, state: GoalState, reason: str = "") -> None:
+        self._status.publish(goal_status_to_message(GoalStatus(stamp, state, reason), self.world_frame))
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """A new episode in the same scene."""

@@ -1,0 +1,61 @@
+"""The main function of every node's executable."""
+
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.utilities import remove_ros_args
+
+from active6d_core.ros.node import GraphNode
+
+_WAKE_SECONDS = 1.0
+
+
+def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> None:
+    """Spin one node until interrupted. Exit code 2 on bad arguments."""
+    _refuse_words(list(sys.argv if args is None else args))
+    rclpy.init(args=args)
+    node = None
+    try:
+        try:
+            node = node_type()
+            if node.value("autostart"):
+                node.start()
+        # Only here: a ValueError in a callback is a defect, which needs its traceback and the supervisor's restart.
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        # Not spin(): on an interrupt rclpy wakes the executor a moment before it ends the context, and one that waits
+        # again in that moment would sleep until the next message.
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=_WAKE_SECONDS)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except RuntimeError:
+        # An interrupt between the executor's look at the context and its wait ends in rcl's own error.
+        if rclpy.ok():
+            raise
+    finally:
+        # A terminal and `ros2 launch` both interrupt their children: the second must not tear the clean-up.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _refuse_words(arguments: list[str]) -> None:
+    """End with usage, or with an error: rclpy would drop silently what stands before ``--ros-args``."""
+    words = remove_ros_args(arguments)[1:]
+    if not words:
+        return
+    usage = f"usage: {Path(arguments[0]).stem} [--ros-args -p NAME:=VALUE ... --params-file FILE]"
+    if set(words) & {"-h", "--help"}:
+        print(f"{usage}\nparameters and topics: docs/graph.md, or `ros2 param describe` while it runs")
+        sys.exit(0)
+    print(f"error: '{words[0]}' is not for a node; parameters come after --ros-args\n{usage}", file=sys.stderr)
+    sys.exit(2)
