@@ -17,7 +17,7 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, rotation_angle, transform_points
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
 from active6d_perception.estimators.dense.canonical_frame import (
-    TURNS,
+    AXIS_ANGLES,
     AxisRotation,
     canonical_frame_of,
     rotation_about_z,
@@ -38,7 +38,7 @@ from active6d_perception.estimators.dense.rigid_fit import kabsch, robust_fit
 from active6d_perception.estimators.dense.sphere_bins import CENTRES, density, kernel
 from active6d_perception.estimators.dense.votes import cluster_votes
 
-OBJECTS = {"coffee_cup": AxisRotation.INVISIBLE, "mug": AxisRotation.TOLD_BY_FEATURE, "bunny": AxisRotation.VISIBLE}
+OBJECTS = {"coffee_cup": AxisRotation.INVISIBLE, "mug": AxisRotation.SHOWN_BY_FEATURE, "bunny": AxisRotation.VISIBLE}
 
 
 def random_poses(count, seed=0, distance=0.8):
@@ -47,9 +47,9 @@ def random_poses(count, seed=0, distance=0.8):
     return make_transform(Rotation.random(count, rng=rng).as_matrix(), positions)
 
 
-@pytest.mark.parametrize(("name", "turn"), OBJECTS.items())
-def test_gauge_is_found_from_the_description(name, turn):
-    assert canonical_frame_of(load_object(name)).turn is turn
+@pytest.mark.parametrize(("name", "expected"), OBJECTS.items())
+def test_canonical_frame_is_found_from_the_description(name, expected):
+    assert canonical_frame_of(load_object(name)).axis_rotation is expected
 
 
 def test_axis_of_the_mug_is_the_axis_of_its_inner_wall():
@@ -69,7 +69,7 @@ def test_axis_of_the_mug_is_the_axis_of_its_inner_wall():
 def test_canonical_frame_sees_the_camera_in_its_xz_half_plane(name):
     canonical_frame, poses = canonical_frame_of(load_object(name)), random_poses(50)
     canonical = canonical_frame.canonical_pose(poses)
-    if canonical_frame.turn is AxisRotation.VISIBLE:
+    if canonical_frame.axis_rotation is AxisRotation.VISIBLE:
         assert np.allclose(canonical, poses)
         return
     eye = invert(canonical)[:, :3, 3]
@@ -282,7 +282,7 @@ def test_turn_search_finds_a_visible_handle(azimuth):
     # The search is told the pose with its turn forgotten.
     forgotten = np.random.default_rng(azimuth % 7).uniform(0, 2 * np.pi)
     found = axis_rotation_likelihood(T_camera_axis @ rotation_about_z(forgotten), depth, camera)
-    error = (TURNS[found.argmax()] + forgotten + np.pi) % (2 * np.pi) - np.pi
+    error = (AXIS_ANGLES[found.argmax()] + forgotten + np.pi) % (2 * np.pi) - np.pi
     assert np.degrees(abs(error)) < 10
     turns, certainty = likely_axis_rotations(softmax(found)[None], 1)
     assert turns[0, 0] == found.argmax()
@@ -295,7 +295,7 @@ def test_turn_search_tells_that_a_handle_is_hidden():
     depth, camera = mug_alone(canonical_frame.object_pose(T_camera_axis[None])[0])
     probability = softmax(axis_rotation_likelihood(T_camera_axis, depth, camera))
     # It is behind the mug, and where behind is anybody's guess.
-    behind = np.abs((TURNS + np.pi) % (2 * np.pi) - np.pi) < np.radians(50)
+    behind = np.abs((AXIS_ANGLES + np.pi) % (2 * np.pi) - np.pi) < np.radians(50)
     assert probability[behind].sum() > 0.9
     assert probability.max() < 0.25
 
@@ -311,8 +311,8 @@ def test_a_handle_may_be_behind_what_hides_it_and_not_where_the_camera_looked_th
     owner = np.where(np.abs(covered - uncovered) < 1e-4, 0, -1)
     probability = softmax(axis_rotation_likelihood(T_camera_axis, covered, camera, owner))
     _, certainty = likely_axis_rotations(probability[None], 1)
-    true_side = np.abs((TURNS + np.pi) % (2 * np.pi) - np.pi) < np.radians(40)
-    other_side = np.abs(TURNS - np.pi) < np.radians(40)
+    true_side = np.abs((AXIS_ANGLES + np.pi) % (2 * np.pi) - np.pi) < np.radians(40)
+    other_side = np.abs(AXIS_ANGLES - np.pi) < np.radians(40)
     assert certainty[0, 0] < 0.8
     assert probability[true_side].sum() > 30 * probability[other_side].sum()
 
@@ -333,7 +333,7 @@ def test_a_network_with_the_wrong_owner_does_not_hide_the_handle():
     elsewhere = T_camera_axis.copy()
     elsewhere[0, 3] += 0.3
     found = AxisRotationSearch(model, canonical_frame).log_likelihood(np.stack([T_camera_axis, elsewhere]), surface)[0]
-    assert np.degrees(abs((TURNS[found.argmax()] + np.pi) % (2 * np.pi) - np.pi)) < 10
+    assert np.degrees(abs((AXIS_ANGLES[found.argmax()] + np.pi) % (2 * np.pi) - np.pi)) < 10
     assert likely_axis_rotations(softmax(found)[None], 1)[1] > 0.9
 
 
@@ -350,13 +350,13 @@ def test_turns_of_many_mugs_are_those_of_each_alone():
     together = search.log_likelihood(T_camera_axis, surface)
     assert np.allclose(together[0], search.log_likelihood(T_camera_axis[:1], surface)[0])
     # Starting from another turn shifts the answer and changes nothing else.
-    step = 2 * np.pi / len(TURNS)
+    step = 2 * np.pi / len(AXIS_ANGLES)
     shifted = search.log_likelihood(T_camera_axis[:1] @ rotation_about_z(7 * step), surface)[0]
     assert np.allclose(np.roll(shifted, 7), together[0], atol=1.5)
 
 
 def test_likely_turns_lie_apart():
-    probability = np.exp(-(np.minimum(TURNS, 2 * np.pi - TURNS) ** 2) * 20)
+    probability = np.exp(-(np.minimum(AXIS_ANGLES, 2 * np.pi - AXIS_ANGLES) ** 2) * 20)
     probability += 0.5 * np.roll(probability, 30)
     turns, certainty = likely_axis_rotations((probability / probability.sum())[None], 2)
     assert turns.tolist() == [[0, 30]]

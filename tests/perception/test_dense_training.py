@@ -86,7 +86,7 @@ def test_targets_agree_with_the_renderer(name):
     instance = sample.instance.ravel()[targets.pixel]
     # Back from canonical coordinates to the object's frame by the poses alone.
     to_object = invert(sample.T_camera_object) @ canonical_frame.canonical_pose(sample.T_camera_object)
-    if canonical_frame.turn is AxisRotation.INVISIBLE:
+    if canonical_frame.axis_rotation is AxisRotation.INVISIBLE:
         about = [np.hypot(*rendered[:, :2].T), rendered[:, 2]]
         said = targets.coordinates * model.diameter
         assert np.allclose([np.hypot(*said[:, :2].T), said[:, 2]], about, atol=5e-4)
@@ -102,7 +102,7 @@ def test_targets_agree_with_the_renderer(name):
     frames = ray_rotation(origin)
     axis = (sample.T_camera_object[:, :3, :3] @ canonical_frame.T_object_axis[:3, 2])[instance]
     assert np.allclose(np.einsum("pij,pj->pi", frames[instance], targets.axis), axis, atol=1e-5)
-    if canonical_frame.turn is AxisRotation.INVISIBLE:
+    if canonical_frame.axis_rotation is AxisRotation.INVISIBLE:
         assert not targets.direction.any()
     else:
         x = np.einsum(
@@ -348,7 +348,7 @@ def test_training_goes_on_where_it_stopped(tmp_path, trained, mug_view):
     with pytest.raises(ValueError, match="other options"):
         train(model, shards, [mug_view[0]], tmp_path, quick(learning_rate=1e-4))
     (tmp_path / "state.safetensors").write_bytes(b"broken")
-    with pytest.raises(ValueError, match=r"state\.safetensors: cannot go on"):
+    with pytest.raises(ValueError, match=r"state\.safetensors: cannot resume"):
         train(model, shards, [mug_view[0]], tmp_path, quick())
 
 

@@ -1,11 +1,11 @@
-"""How loops are compiled: those over points, each of which needs something else looked at.
+"""Compilation of loops over points that NumPy cannot express well.
 
-Numbers come out as numpy's would, for no operation is reordered or fused. Functions take contiguous, writable arrays of
-one type: others would be compiled for anew, while a view waits. Whoever makes an object that needs them calls them
-once. No index is checked, so what is not a number must not become one.
+Results are those of NumPy, because no operation is reordered or fused. Compiled functions take contiguous, writable
+arrays of one type; other types would be compiled again while a view is processed. Objects that use such functions call
+them once when they are created. Indices are not checked, so NaN must not become an index.
 """
 
 import numba
 
-#: Decorates a function. Kept on disk; runs beside other threads; a division by zero is infinite, as in numpy.
+#: Decorator. Compiled code is cached on disk and releases the GIL; a division by zero gives infinity, as in NumPy.
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy")

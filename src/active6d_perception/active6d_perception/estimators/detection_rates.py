@@ -1,4 +1,4 @@
-"""Rates over many views of an estimator, as BOP defines them, with the uncertainty that comes from few scenes."""
+"""Detection rates of an estimator over many views, as BOP defines them, with confidence intervals."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from scipy.stats import mannwhitneyu, spearmanr
 
 from active6d_perception.estimators.single_view_evaluation import ViewResult
 
-#: BOP counts objects from this visible fraction on.
+#: BOP counts objects whose visible fraction is at least this.
 LEAST_VISIBLE = 0.1
 #: BOP's thresholds of MSSD as shares of the diameter.
 MSSD_THRESHOLDS = np.arange(1, 11) * 0.05
@@ -18,17 +18,17 @@ _RESAMPLES = 2000
 
 
 def bootstrapped(hits: np.ndarray, counts: np.ndarray, groups: Sequence) -> dict[str, float | int | None]:
-    """A rate ``hits / counts`` with its 95 % interval, resampling whole groups.
+    """The rate ``hits / counts`` with its 95 % bootstrap interval.
 
-    Views of one scene share its objects, so that scenes are what is resampled, unless there is only one.
+    Whole scenes are resampled, because views of one scene show the same objects. With a single scene, views are.
 
     Args:
-        hits: (v,) per view.
-        counts: (v,) per view.
-        groups: (v,) the scene of each view.
+        hits: (v,) number of hits in each view.
+        counts: (v,) number of trials in each view.
+        groups: (v,) scene of each view.
 
     Returns:
-        ``rate``, ``low``, ``high`` (None without a count) and ``of``, the sum of the counts.
+        ``rate``, ``low`` and ``high`` (None without a trial), and ``of``, the number of trials.
     """
     total = int(np.sum(counts))
     if total == 0:
@@ -47,18 +47,19 @@ def bootstrapped(hits: np.ndarray, counts: np.ndarray, groups: Sequence) -> dict
 
 
 def thresholds(error: str, diameter: float, width: int) -> np.ndarray:
-    """(10,) BOP's limits of ``mssd`` (metres) or ``mspd`` (pixels of an image of that width)."""
+    """(10,) BOP's thresholds of ``mssd`` (metres) or ``mspd`` (pixels of an image of that width)."""
     return MSSD_THRESHOLDS * diameter if error == "mssd" else MSPD_THRESHOLDS * width / 640.0
 
 
 def recalls(views: Sequence[ViewResult], error: str, diameter: float) -> tuple[np.ndarray, np.ndarray]:
-    """Objects found at BOP's thresholds, task "6D localization": only as many of the best hypotheses count as there are
-    objects.
+    """Objects found at BOP's thresholds (task "6D localization").
+
+    In each view, the number of hypotheses that count is the number of objects; the best scored ones are taken.
 
     Args:
-        views: results.
+        views: results in v views.
         error: ``mssd`` or ``mspd``.
-        diameter: of the object, metres.
+        diameter: the object's, metres.
 
     Returns:
         (v, 10) objects found per view and threshold, (v,) objects at least a tenth visible.
@@ -75,10 +76,10 @@ def recalls(views: Sequence[ViewResult], error: str, diameter: float) -> tuple[n
 
 
 def average_precision(views: Sequence[ViewResult], error: str, limits: Sequence[float]) -> float | None:
-    """Mean over ``limits`` of the area under precision over recall, hypotheses of all views ranked by score.
+    """Mean over ``limits`` of the area under the curve of precision over recall, over the hypotheses of all views.
 
-    As BOP's task "6D detection" (and COCO): 101 recalls, precision made monotone; objects less than a tenth visible
-    need not be found, and whoever finds one neither gains nor loses. None without an object to be found.
+    As in BOP's task "6D detection" and in COCO: 101 recall steps and monotone precision. Objects less than a tenth
+    visible are ignored, and so are hypotheses that match them. None without an object to be found.
     """
     if not _objects(views):
         return None
@@ -91,9 +92,9 @@ def average_precision(views: Sequence[ViewResult], error: str, limits: Sequence[
 
 
 def recall_at_precision(views: Sequence[ViewResult], error: str, limit: float, least: float) -> float | None:
-    """Share of the objects found where the score is cut so that at least ``least`` of the hypotheses are right.
+    """The highest recall at a precision of at least ``least``, over all thresholds of the score.
 
-    Counted as in :func:`average_precision`; 0 where no cut is that precise, None without an object to be found.
+    Counted as in :func:`average_precision`. 0 if no threshold is that precise, None without an object to be found.
     """
     if not _objects(views):
         return None
@@ -102,18 +103,18 @@ def recall_at_precision(views: Sequence[ViewResult], error: str, limit: float, l
 
 
 def _objects(views: Sequence[ViewResult]) -> int:
-    """How many objects have to be found."""
+    """Number of objects that have to be found."""
     return sum(int((view.visible_fraction >= LEAST_VISIBLE).sum()) for view in views)
 
 
 def _precision_over_recall(views: Sequence[ViewResult], error: str, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Recall and monotone precision as the hypotheses of all views are taken in, best first."""
+    """Recall and monotone precision after each of the hypotheses of all views, best first."""
     order = np.argsort(-np.concatenate([view.score for view in views]), kind="stable")
     counted, right = [], []
     for view in views:
         hidden = view.visible_fraction < LEAST_VISIBLE
         matched = view.match(error, limit, hidden.astype(int))
-        counted.append(~np.append(hidden, False)[matched])  # -1, no match, is the last
+        counted.append(~np.append(hidden, False)[matched])  # -1, no match, indexes the last entry
         right.append(matched >= 0)
     counted, right = np.concatenate(counted)[order], np.concatenate(right)[order]
     hits = np.cumsum(right[counted])
@@ -122,14 +123,14 @@ def _precision_over_recall(views: Sequence[ViewResult], error: str, limit: float
 
 
 def area_under_curve(score: np.ndarray, right: np.ndarray) -> float | None:
-    """Probability that a right hypothesis scores higher than a wrong one, ties counting half; None without either."""
+    """Probability that a right hypothesis scores higher than a wrong one, ties counting half; None without both."""
     if right.all() or not right.any():
         return None
     return float(mannwhitneyu(score[right], score[~right]).statistic / (right.sum() * (~right).sum()))
 
 
 def rank_correlation(score: np.ndarray, error: np.ndarray) -> float | None:
-    """Spearman's; None where one of them is constant."""
+    """Spearman's rank correlation of score and error; None if one of them is constant."""
     if len(score) < 3 or np.ptp(score) == 0 or len(np.unique(error)) == 1:
         return None
     return float(spearmanr(score, error).statistic)

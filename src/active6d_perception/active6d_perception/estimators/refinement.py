@@ -1,7 +1,7 @@
-"""Refining, judging and thinning out pose candidates against a depth image; common to all estimators.
+"""Refinement, evidence and masks of pose candidates from a depth image, used by all estimators.
 
-Only the model's surface that the camera can see takes part: with hidden surface in it, the iterative closest point
-method pulls the far side of a thin-walled object onto the near side's measurements.
+All functions use only the part of the model's surface that the camera can see. With hidden surface, the iterative
+closest point method would pull the far side of a thin-walled object onto measurements of the near side.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from active6d_perception.model.model_views import ModelViews
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a depth image says of k poses, as fractions of the model surface that the camera would see.
+    """Evidence of a depth image for k poses, as fractions of the model surface that the camera would see.
 
     Attributes:
-        fitting: (k,) measured where the pose puts it, with a normal alike.
-        violated: (k,) the camera looked through it: something behind it was measured.
-        occluded: (k,) behind something else.
+        fitting: (k,) fraction measured where the pose puts it, with a similar normal.
+        violated: (k,) fraction that the camera looked through: something behind it was measured.
+        occluded: (k,) fraction behind something else.
     """
 
     fitting: np.ndarray
@@ -43,12 +43,12 @@ def weigh_evidence(
 
     Args:
         views: the object's precomputed views.
-        T_camera_object: (k, 4, 4).
-        depth: (H, W) metres, NaN invalid.
-        normals: (H, W, 3) facing the camera, NaN unknown.
-        camera: intrinsics of both.
-        samples: visible model points compared per pose.
-        tolerance: metres along the ray within which a point is where it is said to be; twice that is a violation.
+        T_camera_object: (k, 4, 4) poses in the optical frame, metres.
+        depth: (H, W) metres along z, NaN invalid.
+        normals: (H, W, 3) unit normals facing the camera, NaN unknown.
+        camera: intrinsics of both images.
+        samples: number of visible model points compared per pose.
+        tolerance: metres in depth within which a point fits; from twice that on it is violated or occluded.
     """
     index, used = views.visible_subset(samples)
     direction = views.nearest_direction(T_camera_object)
@@ -88,20 +88,20 @@ def refine(
 ) -> np.ndarray:
     """Point-to-plane ICP of many poses at once, each with only the model points visible from the camera.
 
-    Every visible model point takes the nearest scene point within the gate whose normal is alike; planes are the
-    model's, which are free of noise.
+    A visible model point corresponds to the nearest scene point if that is within the gate and has a similar normal.
+    The planes are the model's, which have no noise.
 
     Args:
         views: the object's precomputed views.
-        T_camera_object: (k, 4, 4) initial poses.
-        scene: search tree over (n, 3) measured points in the optical frame.
+        T_camera_object: (k, 4, 4) initial poses in the optical frame, metres.
+        scene: search tree over (n, 3) measured points in the optical frame, metres.
         scene_normals: (n, 3) unit normals facing the camera.
-        gates: metres, the largest correspondence distance of each stage.
-        iterations: per stage.
-        samples: model points per pose.
+        gates: largest distance of correspondences in each stage, metres.
+        iterations: number of iterations per stage.
+        samples: number of model points per pose.
 
     Returns:
-        (k, 4, 4) refined poses; one with fewer than 6 correspondences stays as it was.
+        (k, 4, 4) refined poses; a pose with fewer than 6 correspondences is unchanged.
     """
     T = np.array(T_camera_object, float)
     index, used = views.visible_subset(samples)
@@ -123,12 +123,12 @@ def refine(
 def _point_to_plane_step(
     T: np.ndarray, points: np.ndarray, normals: np.ndarray, targets: np.ndarray, matched: np.ndarray
 ) -> np.ndarray:
-    """One Gauss-Newton step for (k, 4, 4) poses, each turned about its own origin to keep the system well scaled."""
+    """One Gauss-Newton step for (k, 4, 4) poses, each rotated about its own origin to keep the system well scaled."""
     arms = points - T[:, None, :3, 3]
     jacobian = np.concatenate([np.cross(arms, normals), normals], axis=-1) * matched[..., None]
     residual = np.einsum("ksi,ksi->ks", targets - points, normals) * matched
     A = np.swapaxes(jacobian, 1, 2) @ jacobian
-    # A direction that the points leave free (the axis of a cup) must not move; damping holds it.
+    # Damping keeps the pose from moving where the points leave it free, as about the axis of a cup.
     A += np.eye(6) * (1e-4 * np.trace(A, axis1=1, axis2=2)[:, None, None] / 6 + 1e-12)
     step = np.linalg.solve(A, np.einsum("ksi,ks->ki", jacobian, residual)[..., None])[..., 0]
     step[matched.sum(axis=1) < 6] = 0.0
@@ -149,23 +149,23 @@ def claim_pixels(
     min_new: float = 0.5,
     min_pixels: int = 30,
 ) -> np.ndarray:
-    """Masks of poses: the measured pixels that lie on a pose's visible surface. Poses that add nothing get none.
+    """Compute the masks of poses: the measured pixels that lie on the visible surface of each pose.
 
-    Poses claim their pixels in the order given (best first). One that finds less than ``min_new`` of its pixels
-    unclaimed explains what another explains better, and is left out. In the end each pixel goes to the nearest pose.
+    Poses claim pixels in the given order, best first. A pose is left out if less than ``min_new`` of its pixels are
+    unclaimed, because better poses explain the same pixels. Among the poses kept, a pixel belongs to the nearest one.
 
     Args:
         views: the object's precomputed views.
-        T_camera_object: (k, 4, 4), best first.
-        points: (H, W, 3) measured points, optical frame, NaN invalid.
-        candidates: (H, W) bool pixels that may belong to an object.
-        camera: intrinsics.
-        gate: metres; a pixel farther than this from a pose is not claimed by it.
-        min_new: fraction.
-        min_pixels: a mask smaller than this is no mask.
+        T_camera_object: (k, 4, 4) poses in the optical frame, metres, best first.
+        points: (H, W, 3) measured points in the optical frame, metres, NaN invalid.
+        candidates: (H, W) bool, which pixels may belong to an object.
+        camera: intrinsics of the images.
+        gate: metres; a pose does not claim pixels farther than this from its surface.
+        min_new: smallest unclaimed fraction of a pose's pixels.
+        min_pixels: smallest number of pixels of a mask.
 
     Returns:
-        (H, W) uint16: 1 + index of the pose, 0 for none.
+        (H, W) uint16: 1 + index of the pose, 0 without a pose.
     """
     label = np.zeros(candidates.shape, np.uint16)
     nearest = np.full(candidates.shape, gate)

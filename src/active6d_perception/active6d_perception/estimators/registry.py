@@ -1,4 +1,4 @@
-"""What a pose estimator is, and how one is found by name. The graph knows estimators only through this module."""
+"""The interface of pose estimators, and the registry that creates them by name."""
 
 from pathlib import Path
 from typing import Any, Protocol
@@ -8,15 +8,15 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel, find_beside
 from active6d_core.registry import Registry
 
-#: Networks of the learned estimator that come with this package.
+#: Folder of the shipped networks of the learned estimator.
 SHIPPED_WEIGHTS = Path(__file__).parent / "dense" / "weights"
 
 
 class Estimator(Protocol):
-    """Says which instances of one object a view shows, and where."""
+    """Estimates the poses of all instances of one object in a view."""
 
     def estimate(self, view: View) -> Hypotheses:
-        """Pose hypotheses of ``view`` in its optical frame, with boxes and masks (paper, "6D object pose estimation").
+        """Estimate pose hypotheses in the optical frame, with boxes and masks (paper, "6D object pose estimation").
 
         An estimator is deterministic: the same view gives the same hypotheses.
         """
@@ -24,12 +24,12 @@ class Estimator(Protocol):
 
 
 def choose_estimator(object_name: str) -> str:
-    """What ``auto`` stands for: the learned estimator if the object has weights, else the training-free one."""
+    """The estimator that ``auto`` selects: the learned one if the object has weights, else the training-free one."""
     return "dense" if weights_path(object_name).is_file() else "geometric"
 
 
 def weights_path(object_name: str) -> Path:
-    """The object's network: beside its description if it is one that was added, else where shipped ones are."""
+    """Path of the object's network: beside the object's description if it is there, else among the shipped ones."""
     return find_beside(f"{object_name}.safetensors", SHIPPED_WEIGHTS)
 
 
@@ -43,7 +43,7 @@ _registry = Registry(
 )
 #: Decorates a factory ``(model, **parameters) -> Estimator``; see :meth:`active6d_core.registry.Registry.register`.
 register_estimator = _registry.register
-#: Names that :func:`create_estimator` knows beside ``auto``.
+#: Names of all estimators, without ``auto``.
 list_estimators = _registry.names
 
 
@@ -52,10 +52,10 @@ def create_estimator(name: str, model: ObjectModel, **parameters: Any) -> Estima
 
     Args:
         name: one of :func:`list_estimators`, or ``auto`` for :func:`choose_estimator`'s choice.
-        model: the object that it looks for.
+        model: the object to estimate poses of.
         **parameters: keyword arguments of the estimator's factory.
 
     Raises:
-        ValueError: unknown name, unknown parameter or bad value; the message names it and what is known.
+        ValueError: unknown name, unknown parameter or bad value; the message names it and lists the known ones.
     """
     return _registry.create(name, model, **parameters)

@@ -1,4 +1,4 @@
-"""What an estimator finds of a scene in one view, and fusion after several, next to the truth; needs ground truth."""
+"""Evaluation of an estimator against ground truth: in single views, and after fusing several views."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -15,21 +15,21 @@ from active6d_perception.estimators.registry import Estimator
 from active6d_perception.scene.fusion import FusionParameters, SceneFusion
 from active6d_perception.scene.verification import Verifier
 
-#: Pairs of a hypothesis and a true object are compared when their origins are closer than this, in diameters...
+#: A hypothesis and a true object are compared if their origins are closer than this, in diameters...
 _NEAR = 0.5
-#: ...or appear closer than this, as a share of the image's width: BOP's thresholds end at these values.
+#: ...or appear closer than this, as a share of the image width. BOP's largest thresholds are these values.
 _NEAR_IN_IMAGE = 60.0 / 640.0
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledView:
-    """A view and what is truly there.
+    """A view with ground truth.
 
     Attributes:
-        view: what the estimator gets.
+        view: input of the estimator.
         T_world_object: (n, 4, 4) true poses, metres.
-        visible_fraction: (n,) share of each object's silhouette that this view shows, in [0, 1].
-        feature_seen: (n,) share of the surface of the object's named parts that this view shows, NaN where it has none.
+        visible_fraction: (n,) share in [0, 1] of each object's silhouette that this view shows.
+        feature_seen: (n,) share of the surface of the object's named parts that this view shows, NaN without parts.
     """
 
     view: View
@@ -40,27 +40,27 @@ class LabelledView:
 
 @dataclass(frozen=True, eq=False)
 class ViewResult:
-    """One view: n true objects, k hypotheses, and the errors of p pairs of them that are near each other.
+    """Result in one view: n true objects, k hypotheses, and the errors of p pairs that are near each other.
 
-    All other pairs are wrong at every threshold that is in use.
+    All other pairs are wrong at every threshold in use.
 
     Attributes:
         visible_fraction: (n,) of each true object.
         feature_seen: (n,) see :class:`LabelledView`.
-        score: (k,) the estimator's.
-        certainty: (k,) probability that the turn about the axis is right, where the estimator tells it, else NaN.
-        verification: (k,) equation 1.
-        hypothesis: (p,) int.
-        object: (p,) int.
-        add: (p,) e_ADD with symmetries, metres.
+        score: (k,) score of the estimator.
+        certainty: (k,) probability that the rotation about the axis is right, NaN if the estimator does not report it.
+        verification: (k,) verification score (equation 1).
+        hypothesis: (p,) index of the pair's hypothesis.
+        object: (p,) index of the pair's true object.
+        add: (p,) ADD, least over the symmetries, metres.
         adds: (p,) ADD-S, metres.
         mssd: (p,) metres.
         mspd: (p,) pixels.
-        rotation: (p,) degrees between the orientations, the least over the symmetries.
-        width: of the image, pixels.
-        seconds: that the estimator took by the clock.
-        cpu_seconds: that all threads of this process worked meanwhile.
-        stage_ms: of its stages, where it tells.
+        rotation: (p,) angle between the orientations, least over the symmetries, degrees.
+        width: image width in pixels.
+        seconds: wall-clock time of the estimator.
+        cpu_seconds: CPU time of all threads of this process meanwhile.
+        stage_ms: milliseconds of each stage, empty if the estimator does not report them.
     """
 
     visible_fraction: np.ndarray
@@ -81,15 +81,15 @@ class ViewResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     def match(self, error: str, limit: float, candidates: np.ndarray | None = None) -> np.ndarray:
-        """One-to-one matching as in BOP: the best-scored hypothesis first, each takes the nearest object still free.
+        """One-to-one matching as in BOP: hypotheses by falling score, each takes the nearest object that is still free.
 
         Args:
-            error: name of an attribute.
-            limit: errors from here on are no match.
+            error: name of the attribute with the error.
+            limit: pairs match if their error is below this.
             candidates: (n,) int preference of each object, lower first, negative for objects that cannot be matched.
 
         Returns:
-            (k,) index of the matched object, -1 without one.
+            (k,) index of the matched object, -1 without a match.
         """
         preference = np.zeros(len(self.visible_fraction), int) if candidates is None else candidates
         errors = getattr(self, error)
@@ -106,7 +106,7 @@ class ViewResult:
         return matched
 
     def least(self, error: str) -> np.ndarray:
-        """(k,) the smallest error of each hypothesis over all objects, inf when none is near."""
+        """(k,) the smallest error of each hypothesis over all objects, ``inf`` without a near object."""
         result = np.full(len(self.score), np.inf)
         np.minimum.at(result, self.hypothesis, getattr(self, error))
         return result
@@ -114,11 +114,11 @@ class ViewResult:
 
 @dataclass(frozen=True, eq=False)
 class EstimatorResult:
-    """All views of one estimator.
+    """Results of one estimator in all views.
 
     Attributes:
-        diameter: of the object, metres.
-        views: one result each.
+        diameter: the object's, metres.
+        views: result in each view.
     """
 
     diameter: float
@@ -126,30 +126,30 @@ class EstimatorResult:
 
     @property
     def limit(self) -> float:
-        """Metres below which a pose is right by e_ADD or ADD-S."""
+        """Metres; a pose is right if its ADD or ADD-S is below this."""
         return DETECTION_FRACTION * self.diameter
 
     def gather(self, name: str) -> np.ndarray:
-        """An attribute of :class:`ViewResult`, of all views in order."""
+        """An attribute of :class:`ViewResult`, concatenated over all views."""
         return np.concatenate([getattr(view, name) for view in self.views])
 
     def right(self, by: str = "add") -> np.ndarray:
-        """Whether each hypothesis of each view found an object that no better-scored one found; ``by`` add or adds."""
+        """Whether each hypothesis of each view is matched with an object, by ``add`` or ``adds``."""
         return np.concatenate([view.match(by, self.limit) >= 0 for view in self.views])
 
     def found(self, by: str = "add") -> np.ndarray:
-        """Whether each true object of each view was found; ``by`` is add or adds."""
+        """Whether each true object of each view is matched with a hypothesis, by ``add`` or ``adds``."""
         matches = [(len(view.visible_fraction), view.match(by, self.limit)) for view in self.views]
         return np.concatenate([np.isin(np.arange(count), matched) for count, matched in matches])
 
     def detection_rate(self, least_visible: float, by: str = "add") -> float:
-        """Share found of the objects visible by at least that fraction; ``by`` is add or adds. NaN without any."""
+        """Share found of the objects visible by at least ``least_visible``, by ``add`` or ``adds``; NaN without any."""
         counted = self.gather("visible_fraction") >= least_visible
         return float(self.found(by)[counted].mean()) if counted.any() else float("nan")
 
 
 def evaluate_estimator(estimator: Estimator, model: ObjectModel, views: Iterable[LabelledView]) -> EstimatorResult:
-    """Run an estimator on single views, which are drawn one by one, so that they need not all be in memory."""
+    """Run an estimator on single views; they are taken one by one, so that they need not all be in memory."""
     verifier = Verifier(model)
     return EstimatorResult(
         model.diameter, tuple(evaluate_view(estimator, verifier, model, labelled) for labelled in views)
@@ -157,7 +157,7 @@ def evaluate_estimator(estimator: Estimator, model: ObjectModel, views: Iterable
 
 
 def evaluate_view(estimator: Estimator, verifier: Verifier, model: ObjectModel, labelled: LabelledView) -> ViewResult:
-    """Run an estimator on one view and compare what it says with the truth, which it does not see."""
+    """Run an estimator on one view and compare its hypotheses with the ground truth."""
     view = labelled.view
     started, cpu_started = time.perf_counter(), time.process_time()
     found = estimator.estimate(view)
@@ -181,7 +181,7 @@ def evaluate_view(estimator: Estimator, verifier: Verifier, model: ObjectModel, 
 def _pair_errors(
     model: ObjectModel, found: Hypotheses, T_camera_true: np.ndarray, camera: PinholeCamera
 ) -> dict[str, np.ndarray]:
-    """The attributes of :class:`ViewResult` that are of pairs."""
+    """The attributes of :class:`ViewResult` with one entry per pair."""
     t_est, t_gt = found.T_camera_object[:, :3, 3], T_camera_true[:, :3, 3]
     near = np.linalg.norm(t_est[:, None] - t_gt, axis=-1) < _NEAR * model.diameter
     apart = np.linalg.norm(project(t_est, camera)[:, None] - project(t_gt, camera), axis=-1)
@@ -208,13 +208,13 @@ def detection_over_views(
     """Detection rate of the fused objects after 1, 2, ... views of each scene.
 
     Args:
-        estimator: sees only :attr:`LabelledView.view`.
+        estimator: gets only :attr:`LabelledView.view`.
         model: the object.
-        episodes: views of one scene each, all of the same length v.
-        parameters: of the fusion.
+        episodes: e sequences of v views of one scene each.
+        parameters: settings of the fusion.
 
     Returns:
-        (e, v) share of the scene's true objects detected (one to one, e_ADD below 10 % of the diameter).
+        (e, v) share of the scene's true objects detected (one to one, ADD below 10 % of the diameter).
     """
     verifier = Verifier(model)
     rates = []

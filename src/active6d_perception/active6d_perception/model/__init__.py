@@ -1,1 +1,1 @@
-"""What a camera sees of an object model, and distances between its poses."""
+"""Visible surface of an object model per view direction, and distances between its poses."""

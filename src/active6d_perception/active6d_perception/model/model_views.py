@@ -1,9 +1,9 @@
-"""What a camera sees of an object's surface, precomputed for directions all around it.
+"""The visible part of an object's surface, precomputed for view directions all around the object.
 
-Verification, refinement and fusion all need "the model as rendered": the part of the surface that faces the camera and
-is not hidden behind the object itself. Rendering it for each hypothesis costs milliseconds; looking it up by view
-direction costs microseconds, and the directions are dense enough (neighbours at most 9 degrees apart, so a hypothesis
-is at most about 5 degrees from one) that the visible set is the same but for a sliver at the object's outline.
+Verification, refinement and fusion need the model as a camera sees it: the part of its surface that faces the camera
+and that the object itself does not hide. Rendering this part for each hypothesis takes milliseconds, looking it up by
+view direction microseconds. Neighbouring directions are at most 9 degrees apart, so that a hypothesis is at most about
+5 degrees from one. The visible part then differs only by a sliver at the object's outline.
 """
 
 from functools import cached_property, lru_cache
@@ -20,26 +20,26 @@ from active6d_perception.compiled import compiled
 _SUBDIVISIONS = 3  # of an icosahedron: 642 directions
 _EYE_DISTANCE = 6.0  # in diameters: 0.8 m for an object of 0.14 m, as on the view hemisphere
 _SAMPLES = 4096
-# Edge of a cell of samples, in their spacing: a few samples a cell.
+# Edge of a cell, in multiples of the spacing of the samples: a few samples per cell.
 _CELL = 3.0
 
 
 @lru_cache(maxsize=16)
 def model_views(model: ObjectModel) -> "ModelViews":
-    """The views of ``model``, made once per process."""
+    """The views of ``model``, computed once per process."""
     return ModelViews(model)
 
 
 class _Cells(NamedTuple):
-    """Samples of a surface sorted into cubes, so that few of them are looked at to find the nearest.
+    """Samples of a surface sorted into cubes, so that a search for the nearest one compares only a few.
 
     Cells are numbered ``(ix * ny + iy) * nz + iz``.
     """
 
     low: np.ndarray
-    """(3,) corner that cells are counted from, object frame, metres"""
+    """(3,) corner of the first cell, object frame, metres"""
     edge: float
-    """of a cell, metres"""
+    """edge of a cell, metres"""
     shape: tuple[int, int, int]
     """number of cells along x, y and z"""
     start: np.ndarray
@@ -49,17 +49,17 @@ class _Cells(NamedTuple):
     points: np.ndarray
     """(s, 3) float32 samples in the sorted order, metres"""
     visible: np.ndarray
-    """(m, s) bool, whether a direction sees them"""
+    """(m, s) bool, whether a sample is visible from a direction"""
 
 
 @compiled
 def _nearest_visible(
     points: np.ndarray, direction: np.ndarray, bound: float, cells: _Cells
 ) -> tuple[np.ndarray, np.ndarray]:
-    """See :meth:`ModelViews.nearest_visible`; compiled, since every point has other few samples to look at."""
+    """See :meth:`ModelViews.nearest_visible`; compiled, because each point is compared with different samples."""
     distance, found = np.full(len(points), np.inf), np.full(len(points), -1)
     for index in range(len(points)):
-        # Most points are near the surface, and what is found within an edge needs no farther search.
+        # Most points are near the surface: search within one cell's edge first.
         for reach in (min(cells.edge, bound), bound):
             point = points[index, 0], points[index, 1], points[index, 2]
             square, place = _nearest_within(point, direction[index], reach, cells)
@@ -73,8 +73,7 @@ def _nearest_visible(
 def _nearest_within(
     point: tuple[float, float, float], direction: int, reach: float, cells: _Cells
 ) -> tuple[float, int]:
-    """Squared distance and place in the sorted order of the visible sample nearest to a point, -1 where none is within
-    ``reach``."""
+    """Squared distance of the nearest visible sample, and its place in the sorted order, -1 without one in reach."""
     square, best = reach * reach, -1
     x, y, z = point[0] - cells.low[0], point[1] - cells.low[1], point[2] - cells.low[2]
     first, last = _cell(z - reach, 2, cells), _cell(z + reach, 2, cells)
@@ -85,7 +84,7 @@ def _nearest_within(
                 dx = point[0] - cells.points[place, 0]
                 dy = point[1] - cells.points[place, 1]
                 dz = point[2] - cells.points[place, 2]
-                # No branches: which sample is visible or nearer, a processor cannot foresee.
+                # No branches, because a processor could not predict them.
                 candidate = dx * dx + dy * dy + dz * dz if cells.visible[direction, place] else np.inf
                 best = place if candidate < square else best
                 square = min(square, candidate)
@@ -94,20 +93,20 @@ def _nearest_within(
 
 @compiled
 def _cell(along: float, axis: int, cells: _Cells) -> int:
-    """The nearest cell to a coordinate from the corner, metres; the first one to what is none."""
+    """Index along an axis of the cell nearest to a coordinate from the corner, metres; the first cell for NaN."""
     return int(min(along / cells.edge, cells.shape[axis] - 1.0)) if along > 0 else 0
 
 
 class ModelViews:
-    """Surface samples of an object and which of them are visible from where.
+    """Surface samples of an object, and which of them are visible from each view direction.
 
     Attributes:
         points: (s, 3) float32 samples spread evenly over the surface, object frame, metres.
-        normals: (s, 3) float32 outward unit normals there.
-        spacing: metres, half the typical distance between neighbouring samples: each stands for a disc of this radius.
-        directions: (m, 3) unit vectors from the object to the eye, object frame.
-        visible: (m, s) bool, whether a sample is seen by an eye at 6 diameters in that direction.
-        outline: (h, 3) few vertices of the convex hull whose projections bound the object's box.
+        normals: (s, 3) float32 outward unit normals of the samples.
+        spacing: half the typical distance of neighbouring samples, metres; a sample represents a disc of this radius.
+        directions: (m, 3) unit vectors from the object to the camera, object frame.
+        visible: (m, s) bool, whether a camera 6 diameters away in a direction sees a sample.
+        outline: (h, 3) few vertices of the convex hull whose projections bound the object's box, metres.
     """
 
     def __init__(self, model: ObjectModel) -> None:
@@ -124,13 +123,13 @@ class ModelViews:
         self.outline = hull[np.unique((self.directions[:162] @ hull.T).argmax(axis=1))]
 
     def nearest_direction(self, T_camera_object: np.ndarray) -> np.ndarray:
-        """(k,) index of the precomputed direction nearest to the camera's, for (k, 4, 4) poses in the optical frame."""
+        """(k,) index of the precomputed direction nearest to the camera, for (k, 4, 4) poses in the optical frame."""
         eye = -np.einsum("kji,kj->ki", T_camera_object[:, :3, :3], T_camera_object[:, :3, 3])
         return (eye @ self.directions.T).argmax(axis=1)
 
     @cached_property
     def centroids(self) -> np.ndarray:
-        """(m, 3) mean of the visible surface per direction, each part weighted by the area it covers in the image."""
+        """(m, 3) centroid of the visible surface per direction, weighted by area in the image; object frame, metres."""
         eyes = self.directions * self._eye_distance
         facing = eyes @ self.normals.T - np.einsum("si,si->s", self.normals, self.points)
         square_distance = self._eye_distance**2 + (self.points**2).sum(axis=1) - 2 * eyes @ self.points.T
@@ -138,7 +137,7 @@ class ModelViews:
         return weight @ self.points / weight.sum(axis=1, keepdims=True)
 
     def visible_tree(self, direction: int) -> tuple[np.ndarray, cKDTree]:
-        """(v,) indices of the samples visible from a direction, and a search tree over them; kept once made."""
+        """(v,) indices of the samples visible from a direction, and a search tree over them; cached."""
         if direction not in self._trees:
             index = np.flatnonzero(self.visible[direction])
             self._trees[direction] = index, cKDTree(self.points[index])
@@ -165,12 +164,12 @@ class ModelViews:
         number = np.ravel_multi_index(tuple(place.T), shape)
         order = np.argsort(number, kind="stable")
         start = np.searchsorted(number[order], np.arange(np.prod(shape) + 1))
-        # Small numbers, so that all of it stays in the processor's cache.
+        # 16 bits, so that the table stays in the processor's cache.
         start, small = start.astype(np.int16), order.astype(np.int16)
         return _Cells(low, edge, shape, start, small, self.points[order], self.visible[:, order])
 
     def visible_subset(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """At most ``count`` visible samples a direction, evenly taken: (m, count) indices, (m, count) bool used."""
+        """At most ``count`` evenly spaced visible samples per direction: (m, count) indices, (m, count) bool used."""
         if count not in self._subsets:
             self._subsets[count] = self._take_evenly(count)
         return self._subsets[count]
@@ -187,29 +186,29 @@ class ModelViews:
 
 
 def visible_from(mesh: trimesh.Trimesh, eyes: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Which surface points an eye sees, by ray casting.
+    """Determine by ray casting which surface points are visible.
 
     Args:
         mesh: triangle mesh.
-        eyes: (m, 3) positions outside the mesh.
-        points: (s, 3) on its surface.
-        normals: (s, 3) outward normals there.
+        eyes: (m, 3) camera positions outside the mesh, in its frame.
+        points: (s, 3) points on its surface.
+        normals: (s, 3) outward normals at the points.
 
     Returns:
-        (m, s) bool.
+        (m, s) bool, whether a camera sees a point.
     """
     scene = ray_caster(mesh)
     rays = np.empty((len(eyes), len(points), 6), np.float32)
     rays[..., :3] = eyes[:, None]
     rays[..., 3:] = points[None] - rays[..., :3]
-    # A hit at parameter 1 is the sample itself; within 0.1 % is rounding, not an occluder.
+    # A hit at parameter 1 is the sample itself; 0.1 % are allowed for rounding.
     unhidden = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy() > 0.999
     facing = -np.einsum("msi,si->ms", rays[..., 3:], normals) > 0
     return unhidden & facing
 
 
 def ray_caster(mesh: trimesh.Trimesh, threads: int = 0) -> o3d.t.geometry.RaycastingScene:
-    """A mesh to cast rays at and to measure distances from; 0 threads are as many as there are cores."""
+    """A scene of one mesh, for ray casting and distances; 0 threads means one per core."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
     scene.add_triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
     return scene

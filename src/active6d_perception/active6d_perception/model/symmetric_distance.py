@@ -1,22 +1,22 @@
-"""How far apart two poses of one object are, in closed form, when symmetric poses are the same."""
+"""Distance between two poses of a symmetric object, in closed form."""
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from active6d_core.object_model import ObjectModel
 
-# Differences below this are rounding; rounding them away makes results independent of the order of summation.
+# Metres. Distances are rounded to this, so that they do not depend on the order of summation.
 _RESOLUTION = 1e-7
 
 
 class SymmetricDistance:
-    """Root mean square distance between the model's surface points under two poses, minimal over its symmetries.
+    """Root mean square distance of the model's surface points between two poses, least over the symmetries.
 
     With second moment ``S = E[x x^T]`` and mean ``m = E[x]`` over the surface, poses ``(R_a, t_a)`` and ``(R_b, t_b)``
     and a symmetry g, the mean square distance is ``2 tr S - 2 tr(R_b^T R_a S g^T) + |dt|^2 + 2 dt . (R_a - R_b) m``.
-    Only the second term depends on g, and linearly; for rotations about an axis its maximum is a phasor's length. So
-    no point is touched and no angle is sampled. An upper bound of ADD (the mean distance), and equal to it where all
-    points move alike.
+    Only the second term depends on g, and linearly. For rotations about an axis, its maximum is the length of a phasor.
+    So neither points nor angles are sampled. The distance is an upper bound of ADD (the mean distance), and equal to
+    ADD if all points move equally.
     """
 
     def __init__(self, model: ObjectModel) -> None:
@@ -24,13 +24,13 @@ class SymmetricDistance:
         self._group = model.symmetry.discrete
         self._axis = model.symmetry.axis
         mean, moment = points.mean(axis=0), points.T @ points / len(points)
-        # Samples are not exactly symmetric; their moments are made so, or symmetric poses would differ.
+        # The samples are not exactly symmetric, so their moments are averaged over the symmetry group.
         rotations = model.symmetry.rotations(step_degrees=10.0)
         self._mean = (rotations @ mean).mean(axis=0)
         self._moment = (rotations @ moment @ np.swapaxes(rotations, 1, 2)).mean(axis=0)
 
     def between(self, T_a: np.ndarray, T_b: np.ndarray) -> np.ndarray:
-        """All pairs: (n, 4, 4) and (m, 4, 4) poses in one frame to (n, m) metres."""
+        """(n, m) distances in metres between (n, 4, 4) and (m, 4, 4) poses in one frame."""
         R_a, R_b, t_a, t_b = T_a[:, :3, :3], T_b[:, :3, :3], T_a[:, :3, 3], T_b[:, :3, 3]
         overlap = np.max([self._overlap(R_a, R_b @ g) for g in self._group], axis=0)
         # |dt|^2 + 2 dt.(R_a m - R_b m) = |dt + R_a m - R_b m|^2 - |R_a m - R_b m|^2

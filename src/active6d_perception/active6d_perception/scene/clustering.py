@@ -1,7 +1,7 @@
 """Average-linkage clustering of many small groups at once.
 
-The fusion node clusters one scene at a time, the agent's training environment hundreds at a time; both call these
-functions, so that they cannot disagree.
+The fusion node clusters one scene at a time, the agent's training environment hundreds. Both call these functions, so
+that their results agree.
 """
 
 import numpy as np
@@ -10,21 +10,21 @@ import numpy as np
 def cluster_groups(distance: np.ndarray, valid: np.ndarray, cut: float) -> np.ndarray:
     """Hierarchical clustering with average linkage within each of B groups.
 
-    Average linkage merges two clusters by the mean over all their pairs: single linkage would chain neighbouring
-    objects through stray hypotheses between them, and complete linkage would split an object by its worst hypothesis.
+    Average linkage merges two clusters by the mean distance of all their pairs. Single linkage would join neighbouring
+    objects through outliers between them, and complete linkage would split an object because of its worst hypothesis.
 
     Args:
         distance: (B, m, m) symmetric, metres.
         valid: (B, m) bool, which items exist; the others are padding.
-        cut: metres; clusters whose mean distance is above it stay apart.
+        cut: metres; clusters with a larger mean distance are not merged.
 
     Returns:
-        (B, m) cluster of each item, named by its first item.
+        (B, m) cluster of each item: the index of the cluster's first item.
     """
     size = valid.shape[1]
     labels = np.tile(np.arange(size), (len(valid), 1))
     pairs = valid[:, :, None] & valid[:, None, :]
-    # Where all distances are within the cut, all means are.
+    # If all distances are within the cut, all means are.
     tight = np.where(pairs, distance, 0.0).max(axis=(1, 2), initial=0.0) <= cut
     labels[tight] = np.where(valid[tight], valid[tight].argmax(axis=1)[:, None], labels[tight])
     groups = np.flatnonzero(~tight)
@@ -39,7 +39,7 @@ def cluster_groups(distance: np.ndarray, valid: np.ndarray, cut: float) -> np.nd
             groups, table, weight = groups[open_], table[open_], weight[open_]
             label, nearest = label[open_], nearest[open_]
         row = np.arange(len(groups))
-        # The first of equal entries lies above the diagonal, so the earlier item keeps its name.
+        # The first of equal entries lies above the diagonal, so that the earlier item names the cluster.
         first, second = np.divmod(nearest, size)
         share = weight[row, first] / (weight[row, first] + weight[row, second])
         merged = share[:, None] * table[row, first] + (1.0 - share)[:, None] * table[row, second]
@@ -51,10 +51,10 @@ def cluster_groups(distance: np.ndarray, valid: np.ndarray, cut: float) -> np.nd
 
 
 def cluster(distance: np.ndarray, cut: float) -> np.ndarray:
-    """:func:`cluster_groups` of (k, k) distances in metres; (k,) cluster of each item, named by its first item."""
+    """:func:`cluster_groups` for one group: (k, k) distances in metres to the (k,) clusters of the items."""
     count = len(distance)
     labels = np.arange(count)
-    # No mean over distances above the cut is below it, so clusters lie within components of the near pairs.
+    # Clusters lie within connected components of the near pairs: no mean of larger distances is within the cut.
     members, valid = group(_components(distance <= cut))
     blocks = distance[members[:, :, None], members[:, None, :]]
     local = cluster_groups(blocks, valid, cut)
@@ -63,7 +63,7 @@ def cluster(distance: np.ndarray, cut: float) -> np.ndarray:
 
 
 def _components(near: np.ndarray) -> np.ndarray:
-    """(k,) first item of each item's connected component; for tens of items this beats building a sparse graph."""
+    """(k,) first item of each item's connected component; for tens of items faster than a sparse graph."""
     component = near.argmax(axis=1)
     while True:
         lowest = np.where(near, component, len(near)).min(axis=1, initial=len(near))
@@ -74,13 +74,13 @@ def _components(near: np.ndarray) -> np.ndarray:
 
 
 def group(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Items with equal keys, one group per row.
+    """Group items by their keys.
 
     Args:
-        keys: (k,) integers.
+        keys: (k,) integers; items with equal keys form a group.
 
     Returns:
-        (B, m) indices of the items of each group, rising, padded with any; (B, m) bool, which are not padding.
+        (B, m) indices of the items of each group, rising, with arbitrary padding; (B, m) bool, which are not padding.
     """
     order = np.argsort(keys, kind="stable")
     starts = np.flatnonzero(np.diff(keys[order], prepend=-1 if not len(keys) else keys[order[0]] - 1))

@@ -1,8 +1,8 @@
-"""Multi-view fusion: all hypotheses so far, clustered in the world; the best of each cluster is an object.
+"""Multi-view fusion: clusters the hypotheses of all views in the world; the best of each cluster is an object.
 
-:func:`cluster`, :func:`select` and :func:`project_features` are pure and know nothing of messages or history, so a
-training environment calls the same ones on precomputed tables. :class:`SceneFusion` keeps the history.
-Paper, "Multi-view hypotheses fusion" and "Objects feature representation".
+:func:`.cluster`, :func:`select` and :func:`project_features` keep no state, so that a training environment calls the
+same functions on precomputed tables. :class:`SceneFusion` keeps the hypotheses of all views. The method is that of the
+paper, "Multi-view hypotheses fusion" and "Objects feature representation".
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from active6d_perception.scene.clustering import cluster
 from active6d_perception.scene.observed_surface import EXPLAINED_WITHIN
 from active6d_perception.suppression import suppress_neighbours
 
-#: Ways to rank hypotheses, see :attr:`FusionParameters.rank_by`.
+#: Ways to rank hypotheses, see :class:`FusionParameters`.
 RANKINGS = ("evidence", "confidence", "verification", "score")
 
 
@@ -29,18 +29,18 @@ class FusionParameters:
     """Settings of the fusion.
 
     Attributes:
-        cut: clusters are cut where the distance between them exceeds this fraction of the diameter.
-        exclusion: of two objects whose origins are closer than this fraction of the diameter only the better one
-            stays: solid objects cannot share their centre, but a pose that is ambiguous in some views (a mug with its
-            handle hidden) puts several clusters there. 0 keeps all.
-        min_verification: objects verified worse are not reported; the paper reports all, so -1 by default.
-        rank_by: which hypothesis of a cluster is best, and which of the clusters that claim one place. ``verification``
-            is equation 1 alone, the paper's; ``score`` the estimator's score; ``confidence`` the product of both: the
-            score knows of what equation 1 cannot see, since a mug fits its pixels whichever way its hidden handle
-            points. With these three a cluster is as good as its best hypothesis, so among many views one that is
-            wrong and sure of itself prevails. ``evidence`` takes the hypothesis of the highest confidence, and the
-            cluster whose squared confidences have the largest sum: views that agree outvote the one.
-        explained_within: surface at most this fraction of the diameter away from an object is that object's, see
+        cut: clusters are merged while their mean distance is at most this fraction of the diameter.
+        exclusion: of two objects whose origins are closer than this fraction of the diameter, only the better one is
+            kept. Solid objects cannot share a centre, but a pose that is ambiguous in some views (a mug with a hidden
+            handle) gives several clusters there. 0 keeps all.
+        min_verification: hypotheses with a lower verification score are not used. The paper uses all: -1, the default.
+        rank_by: the criterion for the best hypothesis of a cluster, and for the best of clusters at one place.
+            ``verification`` is equation 1, as in the paper. ``score`` is the estimator's score.
+            ``confidence`` is the product of both, because equation 1 cannot see everything: a mug with a hidden handle
+            fits its pixels at every rotation. With these three a cluster is ranked by its best hypothesis, so that one
+            overconfident wrong view can win. ``evidence`` takes the hypothesis with the highest confidence, and ranks
+            clusters by the sum of their squared confidences, so that views which agree win.
+        explained_within: an object explains surface at most this fraction of the diameter away, see
             :class:`~active6d_perception.scene.observed_surface.Explainer`.
 
     Raises:
@@ -67,16 +67,16 @@ class FusionParameters:
 
 
 def select(labels: np.ndarray, weight: np.ndarray | None, positions: np.ndarray, exclusion: float) -> np.ndarray:
-    """The best of each cluster that shares its place with no better one.
+    """Select the best hypothesis of each cluster, without clusters that are too close to a better one.
 
     Args:
-        labels: (k,) clusters of hypotheses in order of preference, best first; each named by its first.
-        weight: (k,) what each hypothesis adds to its cluster's evidence; None ranks clusters by their best.
-        positions: (k, 3) metres.
-        exclusion: metres.
+        labels: (k,) clusters of hypotheses in order of preference, each named by the index of its first hypothesis.
+        weight: (k,) evidence of each hypothesis for its cluster; None ranks clusters by their best hypothesis.
+        positions: (k, 3) of the hypotheses in the world, metres.
+        exclusion: smallest distance between two objects, metres.
 
     Returns:
-        (n,) indices, best first.
+        (n,) indices of the selected hypotheses, best first.
     """
     best = np.flatnonzero(labels == np.arange(len(labels)))
     if weight is not None:
@@ -88,18 +88,18 @@ def select(labels: np.ndarray, weight: np.ndarray | None, positions: np.ndarray,
 def summarise(
     labels: np.ndarray, chosen: np.ndarray, stamps: np.ndarray, distance: np.ndarray, stamp: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the clusters of the chosen hypotheses consist of.
+    """Compute support, spread and current hypothesis of clusters.
 
     Args:
         labels: (k,) clusters of hypotheses in order of preference.
-        chosen: (n,) one hypothesis of each cluster in question.
-        stamps: (k,) views that the hypotheses are from.
-        distance: (k, k) metres.
-        stamp: the current view.
+        chosen: (n,) index of one hypothesis in each of n clusters.
+        stamps: (k,) stamps of the hypotheses' views, nanoseconds.
+        distance: (k, k) between the hypotheses, metres.
+        stamp: of the current view, nanoseconds.
 
     Returns:
-        (n,) number of views with a hypothesis in the cluster, (n,) largest distance within it, and (n,) its best
-        hypothesis from the current view, -1 without one.
+        (n,) support: number of views with a hypothesis in the cluster; (n,) spread: largest distance within the
+        cluster, metres; (n,) index of the cluster's best hypothesis from the current view, -1 without one.
     """
     support, spread, current = np.zeros(len(chosen), np.int64), np.zeros(len(chosen)), np.full(len(chosen), -1)
     for index in range(len(chosen)):
@@ -116,28 +116,28 @@ def summarise(
 
 
 def confidence(verification: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """(k,) from 0 to 2: equation 1, counted from -1, its least, times the estimator's score."""
+    """(k,) in [0, 2]: the verification score plus 1, times the estimator's score."""
     return (1.0 + verification) * score
 
 
 def evidence(verification: np.ndarray, score: np.ndarray, parameters: FusionParameters) -> np.ndarray | None:
-    """(k,) what each hypothesis adds to its cluster's evidence; None where a cluster is as good as its best."""
+    """(k,) evidence of each hypothesis for its cluster; None if clusters are ranked by their best hypothesis."""
     return confidence(verification, score) ** 2 if parameters.rank_by == "evidence" else None
 
 
 def preference(
     verification: np.ndarray, score: np.ndarray, T_world_object: np.ndarray, parameters: FusionParameters
 ) -> np.ndarray:
-    """Hypotheses in the order in which fusion prefers them.
+    """Order hypotheses by preference, and leave out those that are verified too badly.
 
     Args:
-        verification: (k,) equation 1.
-        score: (k,) the estimator's.
-        T_world_object: (k, 4, 4).
-        parameters: how to rank, and what to leave out.
+        verification: (k,) verification scores (equation 1).
+        score: (k,) scores of the estimator.
+        T_world_object: (k, 4, 4) poses in the world, metres.
+        parameters: how to rank and what to leave out.
 
     Returns:
-        (h,) indices, best first; ties by pose, so that the order of arrival never matters.
+        (h,) indices, best first. Equal hypotheses are ordered by pose, so that the order of views does not matter.
     """
     worth = {"verification": verification, "score": score}.get(parameters.rank_by, confidence(verification, score))
     entries = T_world_object[:, :3].reshape(len(verification), 12)
@@ -148,21 +148,21 @@ def preference(
 def project_features(
     views: ModelViews, T_camera_object: np.ndarray, camera: PinholeCamera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Box and depth that objects would have in a camera if nothing hid them.
+    """Compute the box and depth of objects in a camera, as if nothing hid them.
 
     Args:
         views: the object's precomputed views.
-        T_camera_object: (n, 4, 4).
+        T_camera_object: (n, 4, 4) poses in the optical frame, metres.
         camera: intrinsics.
 
     Returns:
         (n, 4) boxes, normalised and clipped to the image, and (n,) mean depths of the visible surface, metres.
     """
     R, t = T_camera_object[:, :3, :3], T_camera_object[:, :3, 3]
-    # Coordinates before points, so that each is one contiguous row: several times faster than the other way round.
+    # Each coordinate is one contiguous row, which is several times faster than one row per point.
     points = (R.reshape(-1, 3) @ views.outline.T).reshape(len(R), 3, len(views.outline)) + t[..., None]
     ratio = points[:, :2] / np.maximum(points[:, 2:], 1e-3)
-    # Pixels rise with the ratios, so that only the outermost need be computed.
+    # Pixel coordinates grow with the ratios, so that only the extremes are needed.
     least, most = ratio.min(axis=2), ratio.max(axis=2)
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx + 0.5, camera.cy + 0.5])
     size = np.array([camera.width, camera.height])
@@ -173,9 +173,9 @@ def project_features(
 
 
 class SceneFusion:
-    """Accumulates the hypotheses of views and says what objects they amount to.
+    """Accumulates the hypotheses of views and computes the objects of the scene from them.
 
-    Results depend on the set of views only, not on their order; a view that is known already adds nothing.
+    Results depend on the set of views but not on their order. A view that is added twice counts once.
     """
 
     def __init__(self, model: ObjectModel, parameters: FusionParameters | None = None) -> None:
@@ -184,7 +184,7 @@ class SceneFusion:
         self._distance = SymmetricDistance(model)
         self._views = model_views(model)
         self.reset()
-        # Now, so that no view waits for the compiler.
+        # Compile now, so that no view has to wait.
         nothing = np.zeros(0, np.int64)
         summarise(nothing, nothing, nothing, np.zeros((0, 0)), 0)
 
@@ -193,12 +193,12 @@ class SceneFusion:
         self._stamps: set[int] = set()
         self._stamp = np.zeros(0, np.int64)
         self._T_world_object = np.zeros((0, 4, 4))
-        # The columns are verification and score, the four of the box, and depth.
+        # Columns: verification, score, box (4), depth.
         self._table = np.zeros((0, 7))
         self._distances = np.zeros((0, 0))
 
     def forget_before(self, stamp: int) -> None:
-        """Forget the views older than ``stamp`` in nanoseconds."""
+        """Forget all views older than ``stamp`` (nanoseconds)."""
         kept = self._stamp >= stamp
         self._stamps = {known for known in self._stamps if known >= stamp}
         self._stamp, self._table = self._stamp[kept], self._table[kept]
@@ -208,19 +208,19 @@ class SceneFusion:
     def add_view(
         self, stamp: int, T_world_camera: np.ndarray, hypotheses: Hypotheses, verification: np.ndarray
     ) -> bool:
-        """Take in the hypotheses of one view.
+        """Add the hypotheses of one view.
 
         Args:
             stamp: nanoseconds; identifies the view.
-            T_world_camera: (4, 4).
+            T_world_camera: (4, 4) pose of the optical frame, metres.
             hypotheses: k hypotheses.
-            verification: (k,) their verification scores (equation 1).
+            verification: (k,) verification scores of the hypotheses (equation 1).
 
         Returns:
-            False when the view was known, and nothing was added.
+            False if the view had been added before, and nothing has changed.
 
         Raises:
-            ValueError: another number of scores than of hypotheses.
+            ValueError: the numbers of scores and hypotheses differ.
         """
         if len(verification) != len(hypotheses):
             raise ValueError(f"fusion: {len(verification)} verification scores for {len(hypotheses)} hypotheses")
@@ -241,10 +241,15 @@ class SceneFusion:
         return True
 
     def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
-        """The accumulated objects, best first, with features in the camera of view ``stamp``.
+        """The objects of all views so far, best first, with features in one camera.
 
-        An object hypothesised in that view has the box and depth of its own mask there (of the best verified
-        hypothesis in its cluster); for the others they are projected from the pose.
+        An object with a hypothesis in view ``stamp`` has the box and depth of that hypothesis's mask; with several, of
+        the preferred one. Box and depth of other objects are projected from their poses.
+
+        Args:
+            stamp: of the current view, nanoseconds.
+            T_world_camera: (4, 4) pose of the current camera's optical frame, metres.
+            camera: its intrinsics.
         """
         order = preference(self._table[:, 0], self._table[:, 1], self._T_world_object, self.parameters)
         if not len(order):

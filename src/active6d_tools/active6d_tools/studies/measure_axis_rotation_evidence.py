@@ -13,7 +13,7 @@ from scipy.special import softmax
 
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
-from active6d_perception.estimators.dense.canonical_frame import TURNS, rotation_about_z
+from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, rotation_about_z
 from active6d_perception.estimators.dense.decoding import axis_rotation_probability, decode
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
@@ -35,9 +35,9 @@ def count(
     instances = decode(estimator.ask(view), depth, output_camera(view.camera), canonical_frame, model.diameter)
     surface = MeasuredSurface.of(view, instances)
     if surface.tree is None or not len(sample.T_camera_object):
-        return np.zeros((0, len(TURNS), SHAPE[0] * SHAPE[1])), np.zeros(0)
+        return np.zeros((0, len(AXIS_ANGLES), SHAPE[0] * SHAPE[1])), np.zeros(0)
     T = instances.T_camera_axis
-    T = T @ rotation_about_z(TURNS[axis_rotation_probability(T, instances.direction).argmax(axis=1)])
+    T = T @ rotation_about_z(AXIS_ANGLES[axis_rotation_probability(T, instances.direction).argmax(axis=1)])
     T = refine(model_views(model), canonical_frame.object_pose(T), surface.tree, surface.tree_normals, gates=(0.008,))
     T = T @ canonical_frame.T_object_axis
     true = canonical_frame.axis_pose(sample.T_camera_object)
@@ -46,7 +46,7 @@ def count(
     R = np.swapaxes(T[:, :3, :3], 1, 2) @ true[:, :3, :3]
     right = (distance.min(axis=1) < 0.008) & (R[:, 2, 2] > np.cos(np.radians(8)))
     instance, turn, case, pixels = search.cases(T, surface)
-    shape = len(T), len(TURNS), SHAPE[0] * SHAPE[1]
+    shape = len(T), len(AXIS_ANGLES), SHAPE[0] * SHAPE[1]
     table = np.bincount(np.ravel_multi_index((instance, turn, case), shape), pixels, np.prod(shape)).reshape(shape)
     return table[right], np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1])[right]
 
@@ -58,7 +58,7 @@ def main() -> None:
         *(count(sample, estimator, search, trained.canonical_frame) for sample in track(samples)), strict=True
     )
     tables, turns = np.concatenate(tables), np.concatenate(turns)
-    off = np.abs((TURNS - turns[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    off = np.abs((AXIS_ANGLES - turns[:, None] + np.pi) % (2 * np.pi) - np.pi)
     right, wrong = (tables[mask].sum(axis=0) for mask in (off < RIGHT, off > WRONG))
     ratio = np.log((right / right.sum() + 3e-4) / (wrong / wrong.sum() + 3e-4))
     print(f"{len(turns)} instances; rows and columns as in dense/turns.py\n{ratio.reshape(SHAPE).round(1)}")

@@ -1,2 +1,4 @@
-"""The learned estimator: a network says per pixel where its object's centre is and which point of the object it sees;
-poses follow from that. ``docs/estimator.md`` tells why it is made this way."""
+"""The learned estimator: a network predicts centre, axis and rotation per pixel, and poses follow from them.
+
+``docs/estimator.md`` explains the design.
+"""

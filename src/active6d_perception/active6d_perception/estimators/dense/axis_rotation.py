@@ -1,25 +1,26 @@
-"""How far an object is turned about its axis of near symmetry, by where its named part (a mug's handle) can be.
+"""The rotation of an object about its axis of near symmetry, from where its named part (a mug's handle) can be.
 
-The network says how likely each turn is by how the object looks. The depth image says more, once the axis is known: at
-each turn the part would be seen at certain pixels, and there its surface is measured or it is not: the camera looked
-through it, or something hides it. What remains possible is told as a distribution.
+The network predicts a distribution of the rotation from the object's appearance. The depth image adds to it, once the
+axis is known. At each angle the part would appear at certain pixels. There the image shows the part's surface, or a
+surface behind it (the camera looked through the part), or one before it (something hides the part). The result is the
+likelihood of each angle.
 """
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from active6d_core.object_model import ObjectModel
-from active6d_perception.estimators.dense.canonical_frame import TURNS, CanonicalFrame, rotation_about_z
+from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, CanonicalFrame, rotation_about_z
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
 from active6d_perception.model.model_views import model_views
 
 _SAMPLES = 64
 _EDGES = np.array([-0.012, -0.006, 0.006, 0.012, np.inf], np.float32)  # metres behind the measured surface
 _ALIKE = 0.6  # cosine between normals
-# Log-likelihood ratios of what is found where the part would be seen, between the right turn and wrong ones. Columns:
-# the pixel is the instance's and not on its body, another's and not on that one's body, nobody's, on its owner's body.
-# Counted by active6d_tools.studies.measure_axis_rotation_evidence on training views, with a network's poses where
-# their axes were right.
+# Log-likelihood ratios, between the right angle and wrong ones, of what is measured where the part would appear.
+# Columns: the pixel belongs to the instance and is off its body; to another instance and off that one's body; to no
+# instance; to any instance and is on its body. Counted by active6d_tools.studies.measure_axis_rotation_evidence on
+# training views, with a network's poses where their axes were right.
 _RATIO = np.array(
     [
         [-1.6, -1.2, -2.6, -3.2],  # the camera looked through
@@ -32,14 +33,14 @@ _RATIO = np.array(
     ]
 )
 _FACING_ELSEWHERE, _FITTING = 2, 6
-# Neighbouring pixels err together: each counts as this share of an independent observation.
+# Errors of neighbouring pixels are correlated: each pixel counts as this share of an independent observation.
 _INDEPENDENT = 0.03
 _ON_BODY = 0.004  # metres
 _CELL = 0.001  # metres, of the body's profile
 
 
 class AxisRotationSearch:
-    """Log-likelihoods of all :data:`TURNS` about the axis, for many instances at once."""
+    """Log-likelihoods of all :data:`AXIS_ANGLES` for many instances at once."""
 
     def __init__(self, model: ObjectModel, canonical_frame: CanonicalFrame) -> None:
         views = model_views(model)
@@ -49,42 +50,42 @@ class AxisRotationSearch:
         chosen = part[np.linspace(0, len(part) - 1, min(_SAMPLES, len(part))).astype(np.intp)]
         self._area = model.mesh.area * len(part) / len(views.points) / len(chosen)
         self._visible = views.visible[:, chosen]
-        # All in the axis frame; the samples at each of the turns: (turns, samples, 3).
+        # All in the axis frame; the samples at each of the angles: (angles, samples, 3).
         self._directions, self._from_origin = (views.directions @ R).astype(np.float32), origin @ R
-        self._rotated = rotation_about_z(TURNS)[:, :3, :3]
+        self._rotated = rotation_about_z(AXIS_ANGLES)[:, :3, :3]
         self._points = ((views.points[chosen] - origin) @ R @ np.swapaxes(self._rotated, 1, 2)).astype(np.float32)
         self._normals = (views.normals[chosen] @ R @ np.swapaxes(self._rotated, 1, 2)).astype(np.float32)
         self._body = _profile((views.points[~is_part] - origin) @ R)
 
     def log_likelihood(self, T_camera_axis: np.ndarray, surface: MeasuredSurface) -> np.ndarray:
-        """Log-likelihood of the depth image for each turn, 0 where the part would be hidden by its own object.
+        """Log-likelihood of the depth image for each angle, 0 where the object itself would hide the part.
 
         Args:
-            T_camera_axis: (n, 4, 4) poses of the axis frame of the surface's instances; their own turn is turn 0.
-            surface: as measured.
+            T_camera_axis: (n, 4, 4) poses of the axis frame of the surface's instances; angles are relative to them.
+            surface: what the view measured.
 
         Returns:
-            (n, len(TURNS)).
+            (n, len(AXIS_ANGLES)).
         """
-        instance, turn, case, pixels = self.cases(T_camera_axis, surface)
-        shape = len(T_camera_axis), len(TURNS)
+        instance, angle, case, pixels = self.cases(T_camera_axis, surface)
+        shape = len(T_camera_axis), len(AXIS_ANGLES)
         value = _INDEPENDENT * _RATIO.ravel()[case] * pixels
-        return np.bincount(instance * shape[1] + turn, value, minlength=shape[0] * shape[1]).reshape(shape)
+        return np.bincount(instance * shape[1] + angle, value, minlength=shape[0] * shape[1]).reshape(shape)
 
     def cases(
         self, T_camera_axis: np.ndarray, surface: MeasuredSurface
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What is measured where the part's samples would be seen; arguments as for :meth:`log_likelihood`.
+        """What is measured where the part's samples would appear; arguments as for :meth:`log_likelihood`.
 
         Returns:
-            of p samples in sight (p,) index of the instance, of the turn, of the case (row * 4 + column of the ratios),
-            and how many pixels the sample stands for.
+            Four (p,) arrays over the samples in sight: index of the instance, index of the angle, index of the case
+            (row * 4 + column of the ratios), and the number of pixels that the sample covers.
         """
         camera = surface.camera
-        instance, turn, sample = np.nonzero(self._visible[self._seen_from(T_camera_axis)])
+        instance, angle, sample = np.nonzero(self._visible[self._seen_from(T_camera_axis)])
         R, t = T_camera_axis[:, :3, :3].astype(np.float32), T_camera_axis[:, :3, 3].astype(np.float32)
-        points = np.einsum("pij,pj->pi", R[instance], self._points[turn, sample]) + t[instance]
-        facing = np.einsum("pij,pj->pi", R[instance], self._normals[turn, sample])
+        points = np.einsum("pij,pj->pi", R[instance], self._points[angle, sample]) + t[instance]
+        facing = np.einsum("pij,pj->pi", R[instance], self._normals[angle, sample])
         x, y, z = points.T
         u, v = np.rint(x / z * camera.fx + camera.cx), np.rint(y / z * camera.fy + camera.cy)
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
@@ -95,19 +96,19 @@ class AxisRotationSearch:
         found[(found == _FACING_ELSEWHERE) & alike] = _FITTING
         owner = surface.owner.ravel()[pixel]
         whose = np.where(owner < 0, 2, np.where(self._on_body(T_camera_axis, surface)[pixel], 3, owner != instance))
-        # Pixels that a sample covers: a slanted one covers fewer.
+        # A sample that is seen at a slant covers fewer pixels.
         slant = np.abs(np.einsum("pi,pi->p", facing, points)) / np.linalg.norm(points, axis=1)
         pixels = self._area * slant * camera.fx * camera.fy / z**2
-        return instance, turn, found * _RATIO.shape[1] + whose, pixels
+        return instance, angle, found * _RATIO.shape[1] + whose, pixels
 
     def _seen_from(self, T_camera_axis: np.ndarray) -> np.ndarray:
-        """(n, turns) index of the model's view direction nearest to the camera's, at each turn."""
+        """(n, angles) index of the model's view direction nearest to the camera's."""
         eye = -np.einsum("nji,nj->ni", T_camera_axis[:, :3, :3], T_camera_axis[:, :3, 3])
-        turned = (eye[:, None, None] @ self._rotated)[:, :, 0] + self._from_origin
-        return (turned.astype(np.float32) @ self._directions.T).argmax(axis=2)
+        rotated = (eye[:, None, None] @ self._rotated)[:, :, 0] + self._from_origin
+        return (rotated.astype(np.float32) @ self._directions.T).argmax(axis=2)
 
     def _on_body(self, T_camera_axis: np.ndarray, surface: MeasuredSurface) -> np.ndarray:
-        """(h * w,) bool, whether a pixel lies on the body of revolution of its own instance."""
+        """(h * w,) bool, whether a pixel lies on its own instance's body of revolution."""
         owner = surface.owner.ravel()
         pixel = np.flatnonzero(owner >= 0)
         T = T_camera_axis[owner[pixel]].astype(np.float32)
@@ -119,9 +120,9 @@ class AxisRotationSearch:
 
 
 def _profile(points: np.ndarray) -> np.ndarray:
-    """(radius, height) bool grid of :data:`_CELL`, height 0 in its middle: what is near the body that ``points`` span.
+    """(radius, height) bool grid of :data:`_CELL`: which cells are near the body that ``points`` sample.
 
-    The grid's last radius and its first and last height are outside.
+    Height 0 is in the middle. The last radius and the first and last height are outside the body.
     """
     profile = np.stack([np.hypot(points[:, 0], points[:, 1]), points[:, 2]], axis=1)
     reach = np.ceil((np.abs(profile).max(axis=0) + _ON_BODY) / _CELL).astype(int) + 2

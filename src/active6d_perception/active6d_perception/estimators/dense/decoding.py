@@ -1,4 +1,4 @@
-"""From the network's answer to poses: instances from votes, a robust rigid fit for each, the turn about the axis."""
+"""From the network's output to poses: instances from votes for centres, then centre and axis of each instance."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from scipy.special import expit, log_softmax, softmax
 from active6d_core.camera import PinholeCamera, pixel_rays
 from active6d_core.se3 import make_transform
 from active6d_perception.estimators.dense.canonical_frame import (
-    TURNS,
+    AXIS_ANGLES,
     AxisRotation,
     CanonicalFrame,
     facing_camera,
@@ -23,14 +23,14 @@ from active6d_perception.estimators.dense.votes import cluster_votes
 
 @dataclass(frozen=True)
 class DecodingParameters:
-    """Thresholds of decoding; lengths in diameters.
+    """Thresholds of decoding; lengths in diameters of the object.
 
     Attributes:
         mask_threshold: probability above which a pixel belongs to an object.
-        pixels: most pixels per instance that take part in the fit.
-        fewest_pixels: an instance with fewer is dropped.
-        tolerance: residual of a correspondence that counts half.
-        coordinates: fit object coordinates to points; otherwise poses come from the votes for centre and axis alone.
+        pixels: largest number of pixels per instance that the fit uses.
+        fewest_pixels: an instance with fewer pixels is dropped.
+        tolerance: residual at which a correspondence has half the weight.
+        coordinates: whether to fit object coordinates to points; otherwise poses come from votes for centre and axis.
     """
 
     mask_threshold: float = 0.5
@@ -42,13 +42,13 @@ class DecodingParameters:
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """n instances that the network's answer shows, p pixels in all.
+    """n instances in the network's output, with p pixels in total.
 
     Attributes:
-        pixel: (p,) flat indices into the answer's image.
+        pixel: (p,) flat indices into the output image.
         label: (p,) index of each pixel's instance.
-        T_camera_axis: (n, 4, 4) pose of the axis frame. Centre and axis are voted for; its turn is the likeliest one
-            where every turn looks different, elsewhere the one that faces the camera.
+        T_camera_axis: (n, 4, 4) poses of the axis frame, metres. Votes give centre and axis. The rotation about the
+            axis is the likeliest one where the whole surface shows it; elsewhere the x axis faces the camera.
         direction: (n, DIRECTION_BINS) distribution of the axis frame's x, in the frame of the ray through its origin.
     """
 
@@ -69,14 +69,14 @@ def decode(
     diameter: float,
     parameters: DecodingParameters = DecodingParameters(),
 ) -> Instances:
-    """Instances and their poses.
+    """Find instances and their poses in the network's output.
 
     Args:
-        answer: (channels, h, w) of the network.
-        depth: (h, w) metres at that resolution, NaN where invalid.
+        answer: (channels, h, w) output of the network.
+        depth: (h, w) metres at the same resolution, NaN where invalid.
         camera: intrinsics of both.
-        canonical_frame: that the network was trained with.
-        diameter: of the object, metres.
+        canonical_frame: the frame that the network was trained with.
+        diameter: the object's, metres.
         parameters: thresholds.
 
     Raises:
@@ -84,7 +84,7 @@ def decode(
     """
     probability = expit(answer[0])
     pixel = np.flatnonzero((probability > parameters.mask_threshold) & np.isfinite(depth))
-    # Channels last, as the network answers, this is a view and each pixel's answer is together.
+    # The network's memory is channels last, so that this makes no copy and each pixel's channels are contiguous.
     parts = split(np.moveaxis(answer, 0, -1).reshape(-1, len(answer))[pixel])
     if parameters.coordinates and "coordinates" not in parts:
         raise ValueError("this network was trained without the coordinates heads")
@@ -100,9 +100,9 @@ def decode(
     R_camera_ray = ray_rotation(clusters.centre)
     direction = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
     T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
-    if canonical_frame.turn is AxisRotation.VISIBLE:
-        # For the fit of coordinates to start at; the search for orientations takes centre and axis alone.
-        T = T @ rotation_about_z(TURNS[axis_rotation_probability(T, direction).argmax(axis=1)])
+    if canonical_frame.axis_rotation is AxisRotation.VISIBLE:
+        # The fit of coordinates starts from this rotation; the orientation search uses centre and axis only.
+        T = T @ rotation_about_z(AXIS_ANGLES[axis_rotation_probability(T, direction).argmax(axis=1)])
     else:
         T = facing_camera(T)
     if count and parameters.coordinates:
@@ -119,23 +119,23 @@ def decode(
 
 
 def axis_rotation_probability(T_camera_axis: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """How likely each turn about the axis is by the network alone.
+    """Probability of each rotation about the axis, from the network alone.
 
     Args:
-        T_camera_axis: (n, 4, 4) poses; their own turn is turn 0.
+        T_camera_axis: (n, 4, 4) poses of the axis frame; angles are relative to them.
         direction: (n, DIRECTION_BINS) as :attr:`Instances.direction`.
 
     Returns:
-        (n, len(TURNS)), each row summing to 1.
+        (n, len(AXIS_ANGLES)), each row summing to 1.
     """
-    x = (T_camera_axis[:, None, :3, :3] @ rotation_about_z(TURNS)[:, :3, :3])[..., 0]
+    x = (T_camera_axis[:, None, :3, :3] @ rotation_about_z(AXIS_ANGLES)[:, :3, :3])[..., 0]
     return density(direction, np.einsum("nij,nti->ntj", ray_rotation(T_camera_axis[:, :3, 3]), x))
 
 
 def _poses_from_axes(
     parts: dict, table: np.ndarray, used: np.ndarray, votes: np.ndarray, R_camera_ray: np.ndarray
 ) -> np.ndarray:
-    """(n, 4, 4) poses from the votes for centre and axis alone, at an arbitrary turn: robust means of both."""
+    """(n, 4, 4) poses from robust means of the votes for centre and axis; the rotation about the axis is arbitrary."""
     centre = _robust_mean(votes[table], used * np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))[table], 0.01)
     axis = _robust_mean(parts["axis"][table].astype(float), used.astype(float), 0.2)
     z = np.einsum("nij,nj->ni", R_camera_ray, axis)
@@ -147,7 +147,7 @@ def _poses_from_axes(
 
 
 def _robust_mean(values: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
-    """(n, 3) reweighted means of (n, p, 3) values; one ``scale`` off the mean counts a quarter."""
+    """(n, 3) reweighted means of (n, p, 3) values; a value one ``scale`` off the mean has a quarter of the weight."""
     trust = weight
     for _ in range(5):
         mean = np.einsum("np,npi->ni", trust, values) / np.maximum(trust.sum(axis=1, keepdims=True), 1e-12)
@@ -156,7 +156,7 @@ def _robust_mean(values: np.ndarray, weight: np.ndarray, scale: float) -> np.nda
 
 
 def member_table(label: np.ndarray, count: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most ``most`` members of each label, evenly taken: (count, most) positions, and which entries are used."""
+    """At most ``most`` evenly spaced members of each label: (count, most) indices, and (count, most) bool used."""
     order = np.argsort(label, kind="stable")
     size = np.bincount(label, minlength=count)
     start = np.cumsum(size) - size

@@ -1,4 +1,4 @@
-"""The learned estimator: pixel-wise regression of object coordinates (paper, "6D object pose estimation")."""
+"""The learned estimator: pixel-wise regression and depth registration (paper, "6D object pose estimation")."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
-from active6d_perception.estimators.dense.canonical_frame import TURNS, AxisRotation, rotation_about_z
+from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, AxisRotation, rotation_about_z
 from active6d_perception.estimators.dense.decoding import (
     DecodingParameters,
     Instances,
@@ -39,24 +39,24 @@ from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.suppression import suppress
 
-# AxisRotationErrors this close to the chosen one count as the same answer when its certainty is told.
-_SAME_TURN = np.radians(30.0)
-# Where an instance's whole surface tells which orientation is right: how many are refined, with which gates; of those
-# that fit best fewer, with smaller gates.
-_TRIED_ORIENTATIONS = ((20, (0.02,)), (12, (0.012, 0.008)))  # metres; votes for centres of slivers are 20 mm off
-# A further turn of an instance is reported only if it is at least this likely.
+# Rotations about the axis this close to the chosen one count towards its certainty.
+_SAME_ROTATION = np.radians(30.0)
+# Rounds of (orientations refined per instance, gates in metres), where the whole surface shows the orientation. The
+# second round takes the best of the first, with smaller gates. Votes for centres of slivers are 20 mm off.
+_TRIED_ORIENTATIONS = ((20, (0.02,)), (12, (0.012, 0.008)))
+# A further rotation of an instance about its axis is reported only if it is at least this likely.
 _LEAST_CERTAINTY = 0.1
-# Exponent of what the network says about the turn, beside what the depth image says.
+# Exponent of the network's distribution of the rotation, relative to the likelihood of the depth image.
 _NETWORK_TRUST = 0.6
 _GATES = (0.008, 0.004)  # metres, of refinement
 _ITERATIONS = 3  # of refinement with each gate; more change nothing on the validation views
 _SAMPLES = 192  # of the model's surface, in refinement
-# Logistic regression of whether a pose's body is right, on the share of its visible surface that is measured where it
-# should be, less what was looked through: slope, and offset by what a turn does. The best of several tried turns fits
-# somewhat even where all are wrong. Fitted on the validation views of cup and mug; the bunny's offset is the one with
-# which .90 of its hypotheses there are right.
+# Logistic regression: the probability that an instance is there and its body is right. The regressor is the share of
+# its visible surface that is measured where it should be, less the share that the camera looked through. The offset
+# depends on the object, since the best of several tried orientations fits somewhat even where all are wrong. Fitted on
+# the validation views of cup and mug; with the bunny's offset .90 of its hypotheses there are right.
 _PRESENCE_SLOPE = 14.0
-_PRESENCE_OFFSET = {AxisRotation.VISIBLE: -1.2, AxisRotation.TOLD_BY_FEATURE: -0.8, AxisRotation.INVISIBLE: -0.8}
+_PRESENCE_OFFSET = {AxisRotation.VISIBLE: -1.2, AxisRotation.SHOWN_BY_FEATURE: -0.8, AxisRotation.INVISIBLE: -0.8}
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ class DenseParameters:
     """Settings of :class:`DenseEstimator`.
 
     Attributes:
-        min_score: an instance that is there with less probability is not reported, however sure its turn; in [0, 1].
+        min_score: instances less probable than this are not reported, however certain their rotation; in [0, 1].
         refined: whether poses are refined against depth.
-        alternatives: most hypotheses per instance; more than one only where the turn about the axis is ambiguous.
-        decoding: thresholds of decoding the network's answer.
+        alternatives: largest number of hypotheses per instance; there are several only if the rotation is ambiguous.
+        decoding: thresholds of decoding the network's output.
 
     Raises:
         ValueError: a value is out of range.
@@ -90,10 +90,10 @@ class Poses:
     """k scored poses of one view.
 
     Attributes:
-        T_camera_object: (k, 4, 4).
+        T_camera_object: (k, 4, 4) poses in the optical frame, metres.
         score: (k,) probability that the pose is right: that the instance is there, times the certainty.
-        instance: (k,) which instance; several poses of one are alternatives.
-        certainty: (k,) probability of the pose's turn about the axis among all turns, 1 where it cannot be mistaken.
+        instance: (k,) index of the instance; several poses of one instance are alternatives.
+        certainty: (k,) posterior probability of the rotation about the axis, 1 where it is not ambiguous.
     """
 
     T_camera_object: np.ndarray
@@ -107,19 +107,19 @@ class Poses:
 
 
 def likely_axis_rotations(probability: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The most likely turns of each instance, none near another.
+    """The most likely rotations of each instance about its axis, at least 30 degrees apart.
 
     Args:
-        probability: (n, len(TURNS)) rows that sum to 1.
-        count: turns per instance.
+        probability: (n, len(AXIS_ANGLES)) rows that sum to 1.
+        count: number of rotations per instance.
 
     Returns:
-        (n, count) indices into :data:`TURNS`, and (n, count) the probability of all turns within 30 degrees of each.
+        (n, count) indices into :data:`AXIS_ANGLES`, and (n, count) the probability within 30 degrees of each.
     """
     chosen, certainty = [], []
     for _ in range(count):
         best = probability.argmax(axis=1)
-        near = np.abs((TURNS - TURNS[best][:, None] + np.pi) % (2 * np.pi) - np.pi) < _SAME_TURN
+        near = np.abs((AXIS_ANGLES - AXIS_ANGLES[best][:, None] + np.pi) % (2 * np.pi) - np.pi) < _SAME_ROTATION
         chosen.append(best)
         certainty.append((probability * near).sum(axis=1))
         probability = np.where(near, 0.0, probability)
@@ -127,7 +127,7 @@ def likely_axis_rotations(probability: np.ndarray, count: int) -> tuple[np.ndarr
 
 
 class DenseEstimator:
-    """Network, instances from votes, robust rigid fits, visible-surface ICP, judgement by the depth image.
+    """Estimates poses by a network, votes for centres, visible-surface ICP, and scores from the depth image.
 
     Attributes:
         stage_ms: duration of each stage of the last view, milliseconds.
@@ -144,12 +144,10 @@ class DenseEstimator:
         self._network = fused(trained.network).to(dtype=self._precision, memory_format=torch.channels_last)
         self._views = model_views(model)
         self._distance = SymmetricDistance(model)
-        self._turns = (
-            AxisRotationSearch(model, trained.canonical_frame)
-            if trained.canonical_frame.turn is AxisRotation.TOLD_BY_FEATURE
-            else None
-        )
-        self._orientations = OrientationSearch(model) if trained.canonical_frame.turn is AxisRotation.VISIBLE else None
+        shown = trained.canonical_frame.axis_rotation
+        by_feature = shown is AxisRotation.SHOWN_BY_FEATURE
+        self._axis_rotations = AxisRotationSearch(model, trained.canonical_frame) if by_feature else None
+        self._orientations = OrientationSearch(model) if shown is AxisRotation.VISIBLE else None
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimators.registry.Estimator.estimate`."""
@@ -174,7 +172,11 @@ class DenseEstimator:
         )
 
     def locate(self, view: View) -> tuple[Poses, np.ndarray]:
-        """Poses in a reduced view, best first, and its (h, w) label image: 1 + ``Poses.instance``, 0 for none."""
+        """Find poses in a view at the network's resolution, see :func:`.reduce_view`.
+
+        Returns:
+            The poses, best first, and the (h, w) uint16 label image: 1 + ``Poses.instance``, 0 for none.
+        """
         answer = self._timed("network", self.ask, view)
         depth = pool_depth(view.depth, OUTPUT_STRIDE)
         instances = self._timed(
@@ -197,7 +199,7 @@ class DenseEstimator:
         return self._timed("judging", self._judge, *candidates, surface)
 
     def ask(self, view: View) -> np.ndarray:
-        """(channels, h, w) answer of the network, in memory channels last."""
+        """(channels, h, w) output of the network for a view at its resolution; channels last in memory."""
         tensor = torch.from_numpy(pad(network_input(view, self.model.diameter)))[None]
         with torch.inference_mode():
             inputs = tensor.to(dtype=self._precision, memory_format=torch.channels_last)
@@ -206,27 +208,27 @@ class DenseEstimator:
         return answer[:, :height, :width].numpy()
 
     def _find_poses(self, instances: Instances, surface: MeasuredSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(k, 4, 4) refined ``T_camera_object``, and (k,) instance and certainty of each; likely turns first."""
+        """(k, 4, 4) refined ``T_camera_object``, and (k,) instance and certainty of each, likely ones first."""
         canonical_frame, T = self._trained.canonical_frame, instances.T_camera_axis
-        if canonical_frame.turn is AxisRotation.INVISIBLE:
+        if canonical_frame.axis_rotation is AxisRotation.INVISIBLE:
             return self._refined(canonical_frame.object_pose(T), surface, _GATES), np.arange(len(T)), np.ones(len(T))
-        if canonical_frame.turn is AxisRotation.VISIBLE:
+        if canonical_frame.axis_rotation is AxisRotation.VISIBLE:
             return self._best_fitting_orientations(instances, surface)
-        # The network's guess of the turn serves to put the axis right, and that to find the turn.
+        # The network's estimate of the rotation serves to refine the axis, and the axis to find the rotation.
         probability = axis_rotation_probability(T, instances.direction)
-        T = T @ rotation_about_z(TURNS[probability.argmax(axis=1)])
+        T = T @ rotation_about_z(AXIS_ANGLES[probability.argmax(axis=1)])
         T = self._refined(canonical_frame.object_pose(T), surface, _GATES[:1]) @ canonical_frame.T_object_axis
         chosen, certainty = likely_axis_rotations(
             self._axis_rotation_probability(T, instances, surface), self.parameters.alternatives
         )
         instance, rank = np.nonzero((np.arange(chosen.shape[1]) == 0) | (certainty > _LEAST_CERTAINTY))
-        T = canonical_frame.object_pose(T[instance] @ rotation_about_z(TURNS[chosen[instance, rank]]))
+        T = canonical_frame.object_pose(T[instance] @ rotation_about_z(AXIS_ANGLES[chosen[instance, rank]]))
         return self._refined(T, surface, _GATES[1:]), instance, certainty[instance, rank]
 
     def _best_fitting_orientations(
         self, instances: Instances, surface: MeasuredSurface
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As :meth:`_find_poses`, where the surface shows the orientation in full: of several that which fits best."""
+        """As :meth:`_find_poses`, where the whole surface shows the orientation: the best fitting of several."""
         count = len(instances)
         T = self._orientations.candidates(instances, surface, _TRIED_ORIENTATIONS[0][0])
         for number, gates in _TRIED_ORIENTATIONS:
@@ -237,10 +239,10 @@ class DenseEstimator:
         return self._refined(T[:, 0], surface, _GATES[1:]), np.arange(count), np.ones(count)
 
     def _axis_rotation_probability(self, T: np.ndarray, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
-        """(n, len(TURNS)) by network and depth together."""
-        measured = self._turns.log_likelihood(T, surface)
-        told = _NETWORK_TRUST * np.log(axis_rotation_probability(T, instances.direction) + 1e-6)
-        return softmax(measured + told, axis=1)
+        """(n, len(AXIS_ANGLES)) posterior of the rotation about the axis, from network and depth image."""
+        measured = self._axis_rotations.log_likelihood(T, surface)
+        predicted = _NETWORK_TRUST * np.log(axis_rotation_probability(T, instances.direction) + 1e-6)
+        return softmax(measured + predicted, axis=1)
 
     def _refined(
         self,
@@ -257,21 +259,21 @@ class DenseEstimator:
         )
 
     def _fit(self, T_camera_object: np.ndarray, surface: MeasuredSurface) -> np.ndarray:
-        """(k,) share of each pose's visible surface that is measured there, less what the camera looked through."""
+        """(k,) share of each pose's visible surface that is measured there, less the share that is looked through."""
         evidence = weigh_evidence(self._views, T_camera_object, surface.depth, surface.normals, surface.camera)
         return evidence.fitting - evidence.violated
 
     def _judge(
         self, T_camera_object: np.ndarray, instance: np.ndarray, certainty: np.ndarray, surface: MeasuredSurface
     ) -> tuple[Poses, np.ndarray]:
-        offset = _PRESENCE_OFFSET[self._trained.canonical_frame.turn]
+        offset = _PRESENCE_OFFSET[self._trained.canonical_frame.axis_rotation]
         presence = expit(_PRESENCE_SLOPE * self._fit(T_camera_object, surface) + offset)
         return self._report(Poses(T_camera_object, presence * certainty, instance, certainty), surface)
 
     def _report(self, poses: Poses, surface: MeasuredSurface) -> tuple[Poses, np.ndarray]:
-        """Without duplicates and without poses that score too little or explain no pixels; instances renumbered."""
+        """Drop duplicates, poses with a low score and poses that explain no pixels; renumber the instances."""
         distance = self._distance.between(poses.T_camera_object, poses.T_camera_object)
-        # Alternatives of one instance are no duplicates unless refinement made them the same.
+        # Alternatives of one instance are duplicates only if refinement made them the same.
         rivals = np.where(
             poses.instance[:, None] == poses.instance, distance, np.minimum(distance, self._centres(poses))
         )
@@ -315,7 +317,13 @@ def create_dense(
     min_score: float = DenseParameters.min_score,
     alternatives: int = DenseParameters.alternatives,
 ) -> DenseEstimator:
-    """Factory; ``weights`` is a ``.safetensors`` file, by default the shipped one of the object.
+    """Factory of the estimator ``dense``.
+
+    Args:
+        model: the object.
+        weights: path of a ``.safetensors`` file; the object's shipped weights when empty.
+        min_score: see :class:`DenseParameters`.
+        alternatives: see :class:`DenseParameters`.
 
     Raises:
         ValueError: the weights are missing, damaged or of another object.

@@ -1,4 +1,4 @@
-"""What a view measured and to which instance each pixel belongs, as refinement and the search for a turn need it."""
+"""The surface that a view measured, and the instance that each pixel belongs to."""
 
 from dataclasses import dataclass
 
@@ -12,15 +12,15 @@ from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSurface:
-    """The surface that a view shows, at the network's input resolution.
+    """The surface that a view measured, at the network's input resolution.
 
     Attributes:
-        depth: (h, w) metres, NaN invalid.
-        points: (h, w, 3) in the optical frame.
+        depth: (h, w) metres along z, NaN invalid.
+        points: (h, w, 3) in the optical frame, metres.
         normals: (h, w, 3) facing the camera, NaN unknown.
-        owner: (h, w) index of the pixel's instance, -1 where there is none or no depth.
+        owner: (h, w) index of the pixel's instance, -1 without an instance or without depth.
         camera: intrinsics.
-        tree: search tree over the points of instances that have normals; None if they are too few.
+        tree: search tree over the instances' points that have normals; None if there are too few.
         tree_normals: (p, 3) of the tree's points.
     """
 
@@ -34,8 +34,8 @@ class MeasuredSurface:
 
     @classmethod
     def of(cls, view: View, instances: Instances) -> "MeasuredSurface":
-        """The surface of a view in which ``instances`` were found."""
-        # The reduced depth is a mean of pixels already; smoothing it more rounds edges off and lets poses slide.
+        """The surface of a view at the network's resolution in which ``instances`` were found."""
+        # Reduced depth is already a mean of pixels. More smoothing would round edges off and let poses slide.
         points = backproject(view.depth, view.camera)
         normals = normals_from_points(points, reach=1)
         height, width = view.depth.shape

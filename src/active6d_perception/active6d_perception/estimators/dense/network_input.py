@@ -1,7 +1,7 @@
-"""From an RGB-D view to what the network sees.
+"""From an RGB-D view to the network's input features.
 
-Distances come in diameters of the object and directions in the frame of the pixel's own ray, so that an object looks
-the same to the network wherever it is in the picture; only its apparent size tells how far away it is.
+Distances are in diameters of the object and directions in the frame of each pixel's ray. So an object gives the same
+features wherever it is in the image; only its apparent size shows how far away it is.
 """
 
 from dataclasses import replace
@@ -12,14 +12,14 @@ from scipy.ndimage import uniform_filter
 
 from active6d_core.camera import PinholeCamera, View, backproject, normals_from_points, pixel_rays
 
-#: Width that a view is reduced to, by a whole factor.
+#: Width in pixels that views are reduced to, by an integer factor.
 INPUT_WIDTH = 320
 #: Sides of the input are padded to multiples of this.
 MULTIPLE = 16
-#: Colour (3), normal (3), depth against its surroundings, near and far (2), validity, apparent size, and the second
-#: moments of the normals around (6): how the surface curves, which is the axis of a cylinder but for its sign.
+#: Colour (3), normal (3), depth relative to a small and a large neighbourhood (2), validity, apparent size, and second
+#: moments of the neighbouring normals (6). The moments show how the surface curves: the axis of a cylinder, unsigned.
 CHANNELS = 16
-#: The network answers at the input's resolution divided by this.
+#: The output's resolution is the input's divided by this.
 OUTPUT_STRIDE = 2
 
 _WINDOWS = (13, 61)  # pixels: a detail of an object, and more than an object
@@ -28,12 +28,12 @@ _SAME_SURFACE = 0.02  # relative difference of depth
 
 
 def reduction(camera: PinholeCamera) -> int:
-    """The whole factor that a view of ``camera`` is reduced by."""
+    """The integer factor by which views of ``camera`` are reduced."""
     return max(1, round(camera.width / INPUT_WIDTH))
 
 
 def reduce_view(view: View) -> View:
-    """Reduce a view to the network's resolution; what the factor does not divide is cut off at the right and bottom."""
+    """Reduce a view to the network's resolution; pixels that the factor does not divide are cut at right and bottom."""
     factor = reduction(view.camera)
     height, width = (size // factor for size in view.depth.shape)
     color = _pool_color(view.color, factor)
@@ -53,11 +53,11 @@ def _pool_color(color: np.ndarray, factor: int) -> np.ndarray:
 
 
 def pool_depth(depth: np.ndarray, factor: int) -> np.ndarray:
-    """Reduce a depth image: in each block the mean over its nearest surface, which never lies between two surfaces.
+    """Reduce a depth image: each block becomes the mean of its nearest surface, never a mean of two surfaces.
 
     Args:
         depth: (H, W) metres, NaN where invalid.
-        factor: side of a block in pixels; what it does not divide is cut off at the right and bottom.
+        factor: side of a block in pixels; pixels that it does not divide are cut at the right and bottom.
 
     Returns:
         (H // factor, W // factor) float32, NaN for a block without a valid pixel.
@@ -83,11 +83,11 @@ def pool_depth(depth: np.ndarray, factor: int) -> np.ndarray:
 
 
 def network_input(view: View, diameter: float) -> np.ndarray:
-    """The (CHANNELS, h, w) float32 tensor for one view, without padding.
+    """The (CHANNELS, h, w) float32 input features of one view, without padding.
 
     Args:
-        view: at the network's resolution.
-        diameter: of the object, metres.
+        view: a view at the network's resolution, see :func:`reduce_view`.
+        diameter: the object's, metres.
     """
     valid = np.isfinite(view.depth)
     z = np.where(valid, view.depth, 0)
@@ -101,27 +101,27 @@ def network_input(view: View, diameter: float) -> np.ndarray:
         around = uniform_filter(z, window, mode="nearest") / np.maximum(share, 1e-3)
         channels[channel] = np.where(valid, np.clip((z - around) / diameter, -1.5, 1.5), 0)
     channels[8] = valid
-    # The last window's mean depth stands in where a pixel has none.
+    # A pixel without depth takes the mean depth of the large neighbourhood.
     channels[9] = view.camera.fx * diameter / np.maximum(np.where(valid, z, around), 0.1) / 64
     channels[10:] = _normal_moments(channels[3:6])
     return channels
 
 
 def _normal_moments(normals: np.ndarray) -> np.ndarray:
-    """(6, h, w) means of xx, yy, zz, xy, yz, zx around each pixel, of (3, h, w) normals that are 0 where invalid."""
+    """(6, h, w) neighbourhood means of xx, yy, zz, xy, yz, zx of (3, h, w) normals, which are 0 where invalid."""
     products = np.concatenate([normals * normals, normals * np.roll(normals, -1, axis=0)])
     moments = uniform_filter(products, (0, _MOMENT_WINDOW, _MOMENT_WINDOW), mode="nearest")
     return moments / np.maximum(moments[:3].sum(axis=0), 1e-2)
 
 
 def pad(tensor: np.ndarray) -> np.ndarray:
-    """Zeros at the right and bottom of (c, h, w), until both sides are multiples of :data:`MULTIPLE`."""
+    """(c, h, w) padded with zeros at the right and bottom, so that both sides are multiples of :data:`MULTIPLE`."""
     height, width = tensor.shape[1:]
     return np.pad(tensor, ((0, 0), (0, -height % MULTIPLE), (0, -width % MULTIPLE)))
 
 
 def output_camera(input_camera: PinholeCamera) -> PinholeCamera:
-    """Intrinsics of the network's answer, from those of its input; a side that the stride does not divide is cut."""
+    """Intrinsics of the network's output, from those of its input; sides that the stride does not divide are cut."""
     exact = input_camera.scaled(1 / OUTPUT_STRIDE)
     width, height = input_camera.width // OUTPUT_STRIDE, input_camera.height // OUTPUT_STRIDE
     return PinholeCamera(width, height, exact.fx, exact.fy, exact.cx, exact.cy)
@@ -136,7 +136,7 @@ def ray_frames(camera: PinholeCamera) -> np.ndarray:
 
 
 def ray_rotation(direction: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) float32 rotations that turn the optical axis to (..., 3) directions the short way."""
+    """(..., 3, 3) float32 shortest rotations from the optical axis to (..., 3) directions."""
     x, y, w = np.moveaxis(direction / np.linalg.norm(direction, axis=-1, keepdims=True), -1, 0)
     share = 1 / (1 + w)
     rows = [[1 - x * x * share, -x * y * share, x], [-x * y * share, 1 - y * y * share, y], [-x, -y, w]]

@@ -1,8 +1,8 @@
-"""Orientations of whole instances that their measured surface allows, near what the network says of them.
+"""Search for the orientations of an instance that fit its measured surface.
 
-Pixel-wise votes give one orientation, right or wrong; refinement only mends what is some 15 degrees off. Where the
-surface shows the orientation in full (no symmetry, no near symmetry), thousands of orientations can be tried on the
-instance's own points instead, for the price of looking up distances in a grid; the network's votes say which to try.
+Averaged votes give one orientation, which may be wrong, and refinement only corrects errors up to about 15 degrees. For
+objects without (near) symmetry, the search compares thousands of orientations with the instance's points instead. A
+grid of precomputed distances makes each comparison cheap. The network's output selects the orientations to try.
 """
 
 import numpy as np
@@ -19,24 +19,24 @@ from active6d_perception.estimators.dense.sphere_bins import kernel
 from active6d_perception.model.model_views import model_views
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 axes, 18 degrees apart
-_TURNS = 24
-# Orientations per instance, and its points that each is tried on: the likeliest by the network on few, of those the
-# best on more.
+_ANGLES_PER_AXIS = 24
+# Rounds of (orientations per instance, points of the instance): first the orientations that the network finds likeliest
+# on few points, then the best of these on more points.
 _ROUNDS = ((2000, 24), (500, 64))
 _CELL = 0.02  # diameters, of the grid of distances
-_REACH = 0.1  # diameters: a point farther from the surface than this does not fit at all
+_REACH = 0.1  # diameters: a point farther than this from the surface does not fit
 _APART = np.radians(25.0)
-_AXIS_TRUST = 3.0  # concentration of the axis that the network votes for
+_AXIS_TRUST = 3.0  # concentration of the distribution of the axis about the network's vote
 _NETWORK_TRUST = 0.05  # weight of the network's log-probability beside the mean fit of the points
 
 
 class OrientationSearch:
-    """Tries orientations of an object on the points of its instances."""
+    """Compares orientations of an object with the measured points of its instances."""
 
     def __init__(self, model: ObjectModel) -> None:
         axes = trimesh.creation.icosphere(_SUBDIVISIONS).vertices
-        turns = rotation_about_z(np.linspace(0, 2 * np.pi, _TURNS, endpoint=False))[:, :3, :3]
-        self._R = (ray_rotation(_off_pole(axes))[:, None] @ turns).reshape(-1, 3, 3).astype(np.float32)
+        about_axis = rotation_about_z(np.linspace(0, 2 * np.pi, _ANGLES_PER_AXIS, endpoint=False))[:, :3, :3]
+        self._R = (ray_rotation(_off_pole(axes))[:, None] @ about_axis).reshape(-1, 3, 3).astype(np.float32)
         self._bins = kernel(self._R[:, :, 0])
         views = model_views(model)
         self._cell, reach = _CELL * model.diameter, _REACH * model.diameter
@@ -50,28 +50,28 @@ class OrientationSearch:
         self._normals = np.append(views.normals, np.zeros((1, 3), np.float32), axis=0)[nearest]
 
     def candidates(self, instances: Instances, surface: MeasuredSurface, count: int) -> np.ndarray:
-        """The orientations that fit best, with the voted centres.
+        """The orientations that fit best, at the centres that the network voted for.
 
         Args:
-            instances: as decoded; their axis frame is the object's.
-            surface: as measured.
-            count: orientations per instance.
+            instances: the decoded instances; their axis frame is the object's frame.
+            surface: what the view measured.
+            count: number of orientations per instance.
 
         Returns:
-            (n, count, 4, 4) ``T_camera_object``, best first, those of one instance at least 25 degrees apart.
+            (n, count, 4, 4) ``T_camera_object``, metres, best first, those of one instance at least 25 degrees apart.
         """
         centre = instances.T_camera_axis[:, :3, 3]
-        # All in the frame of the ray through the instance's centre, as the network's answer is.
+        # All in the frame of the ray through the instance's centre, like the network's output.
         R_camera_ray = ray_rotation(centre)
         axis = np.einsum("nij,ni->nj", R_camera_ray, instances.T_camera_axis[:, :3, 2])
-        told = np.log(instances.direction @ self._bins.T + 1e-3) + _AXIS_TRUST * axis @ self._R[:, :, 2].T
-        worth, tried = told, np.broadcast_to(np.arange(len(self._R)), told.shape)
+        predicted = np.log(instances.direction @ self._bins.T + 1e-3) + _AXIS_TRUST * axis @ self._R[:, :, 2].T
+        worth, tried = predicted, np.broadcast_to(np.arange(len(self._R)), predicted.shape)
         for number, points in _ROUNDS:
             kept = np.argpartition(-worth, number, axis=1)[:, :number]
             tried = np.take_along_axis(tried, kept, axis=1)
             R = self._R[tried]
             fit = self._fit(R, R_camera_ray, centre, surface, points)
-            worth = fit + _NETWORK_TRUST * np.take_along_axis(told, tried, axis=1)
+            worth = fit + _NETWORK_TRUST * np.take_along_axis(predicted, tried, axis=1)
         rows, best = np.arange(len(instances)), np.zeros((len(instances), count), np.intp)
         for rank in range(count):
             best[:, rank] = worth.argmax(axis=1)
@@ -88,7 +88,7 @@ class OrientationSearch:
         surface: MeasuredSurface,
         points: int,
     ) -> np.ndarray:
-        """(n, k) mean over some of an instance's points of how near and how alike the model's surface is, in [0, 1]."""
+        """(n, k) fit in [0, 1]: mean over points of nearness to the model's surface times agreement of the normals."""
         normals = surface.normals.reshape(-1, 3)
         pixel = np.flatnonzero((surface.owner.ravel() >= 0) & np.isfinite(normals).all(axis=1))
         table, used = member_table(surface.owner.ravel()[pixel], len(centre), points)
@@ -104,5 +104,5 @@ class OrientationSearch:
 
 
 def _off_pole(axes: np.ndarray) -> np.ndarray:
-    """The axes, tilted a little: the short way from +z to -z is not defined."""
+    """The axes, tilted slightly, because the shortest rotation from +z to -z is not defined."""
     return axes + np.array([1e-4, 2e-4, 0.0])

@@ -1,4 +1,4 @@
-"""Rigid transforms from correspondences of which many are wrong, for many objects at once."""
+"""Robust rigid transforms from correspondences with many outliers, for many objects at once."""
 
 import numpy as np
 
@@ -9,15 +9,15 @@ _REWEIGHTINGS = 6
 
 
 def kabsch(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Least squares rigid transforms (Kabsch): least sum of ``w ||target - T source||^2``.
+    """Rigid transforms that minimise the sum of ``w ||target - T source||^2`` (Kabsch).
 
     Args:
-        source: (..., p, 3).
-        target: (..., p, 3).
-        weight: (..., p), not negative.
+        source: (..., p, 3) points.
+        target: (..., p, 3) corresponding points, in the same unit.
+        weight: (..., p) weights w, not negative.
 
     Returns:
-        (..., 4, 4), proper rotations also where the points are in one plane.
+        (..., 4, 4) ``T_target_source``; rotations are proper, also for points in one plane.
     """
     share = (weight / np.maximum(weight.sum(axis=-1, keepdims=True), 1e-12))[..., None]
     mean_source, mean_target = (source * share).sum(axis=-2), (target * share).sum(axis=-2)
@@ -38,21 +38,21 @@ def robust_fit(
     rng: np.random.Generator,
     start: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rigid transforms by random sampling (RANSAC), then iteratively reweighted least squares, of n objects at once.
+    """Rigid transforms of n objects by random sampling (RANSAC), then iteratively reweighted least squares.
 
     Args:
         source: (n, p, 3) points in the object's canonical frame.
-        target: (n, p, 3) the same points as measured.
-        weight: (n, p) trust in each correspondence, 0 for padding.
-        tolerance: same unit as the points; a correspondence this far off counts half.
-        rng: draws the samples.
-        start: (n, s, 4, 4) further candidates, from elsewhere; s may be 0.
+        target: (n, p, 3) the same points as measured, in the same unit.
+        weight: (n, p) weight of each correspondence, 0 for padding.
+        tolerance: in the unit of the points; a correspondence with this residual has half the weight.
+        rng: random generator of the samples.
+        start: (n, s, 4, 4) additional candidates; s may be 0.
 
     Returns:
-        (n, 4, 4) ``T_target_source``, and (n,) the share of trusted correspondences that agree with it, in [0, 1].
+        (n, 4, 4) ``T_target_source``, and (n,) the weighted share of correspondences that agree with it, in [0, 1].
     """
     objects = np.arange(len(source))[:, None, None]
-    # Samples are drawn with the weights' probabilities, by inverting the cumulative sum.
+    # Samples are drawn in proportion to the weights, by inverting their cumulative sum.
     cumulative = np.cumsum(weight, axis=1) / weight.sum(axis=1, keepdims=True)
     drawn = rng.random((len(source), 3 * _TRIPLETS))
     triplet = (cumulative[:, None, :] < drawn[..., None]).sum(axis=-1).clip(0, weight.shape[1] - 1)

@@ -1,4 +1,4 @@
-"""Distributions of a direction, over bins spread evenly on the sphere."""
+"""Distributions of a direction over bins that are spread evenly on the sphere."""
 
 import numpy as np
 
@@ -21,13 +21,13 @@ CENTRES = _fibonacci_sphere(DIRECTION_BINS)
 
 
 def kernel(directions: np.ndarray) -> np.ndarray:
-    """(..., 3) unit vectors to (..., DIRECTION_BINS) float32 shares of the bins around them, which sum to 1."""
+    """Distributions concentrated on (..., 3) unit vectors: (..., DIRECTION_BINS) float32 shares that sum to 1."""
     share = np.exp(_CONCENTRATION * (directions.astype(np.float32) @ CENTRES.T - 1))
     return share / share.sum(axis=-1, keepdims=True)
 
 
 def density(probability: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """How likely directions are under distributions over the bins.
+    """Probability of directions under distributions over the bins.
 
     Args:
         probability: (n, DIRECTION_BINS).

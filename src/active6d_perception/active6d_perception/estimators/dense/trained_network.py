@@ -1,4 +1,4 @@
-"""Shipped and trained networks on disk: tensors in safetensors, everything else in a JSON file beside them."""
+"""Files of trained networks: tensors in safetensors, everything else in a JSON file beside them."""
 
 import json
 from dataclasses import asdict, dataclass, field
@@ -20,14 +20,15 @@ _FORMAT = 1
 
 @dataclass(frozen=True, eq=False)
 class TrainedNetwork:
-    """A network and what it was made for.
+    """A network and the object that it was trained for.
 
     Attributes:
-        network: in evaluation mode.
-        canonical_frame: that it was trained with.
-        object_name: of the object it looks for.
-        diameter: of that object, metres.
-        training: how it was trained and what it reached on the validation split; for people, not used.
+        network: the network, in evaluation mode.
+        canonical_frame: the frame that it was trained with.
+        object_name: name of the object.
+        diameter: the object's, metres.
+        size: channels of the network's layers.
+        training: options and validation results of the training; kept for information only.
     """
 
     network: DenseNetwork
@@ -40,7 +41,7 @@ class TrainedNetwork:
 
 def save_network(path: Path, trained: TrainedNetwork) -> None:
     """Write ``path`` (``.safetensors``, float16) and the JSON file of the same name beside it."""
-    # Half precision halves the file; what it rounds away is far below the noise of training.
+    # Half precision halves the file, and its rounding is far below the noise of training.
     tensors = {
         name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
         for name, tensor in trained.network.state_dict().items()
@@ -54,7 +55,7 @@ def save_network(path: Path, trained: TrainedNetwork) -> None:
         "input_channels": CHANNELS,
         "heads": trained.network.heads,
         "size": asdict(trained.size),
-        "turn": trained.canonical_frame.turn.value,
+        "turn": trained.canonical_frame.axis_rotation.value,
         "T_object_axis": trained.canonical_frame.T_object_axis.tolist(),
         "training": trained.training,
     }
@@ -65,7 +66,7 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
     """Read a trained network for an object. Nothing in the files is executed.
 
     Raises:
-        ValueError: a file is missing or damaged, or was made for another object or another version of the network; the
+        ValueError: a file is missing or damaged, or belongs to another object or another version of the network. The
             message names the file and what to do.
     """
     description = _read_description(path, model)

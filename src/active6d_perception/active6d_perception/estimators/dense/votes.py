@@ -1,4 +1,4 @@
-"""Which pixels belong to one object: clusters of the centres that they vote for."""
+"""Assignment of pixels to objects, by clustering the centres that the pixels vote for."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ from active6d_perception.suppression import suppress
 
 _VOXEL = 0.06  # diameters
 _BANDWIDTH = 0.07  # diameters, of the mean shift's Gaussian kernel
-_SEED = 0.1  # diameters between the places that the shift starts from
-_MERGE = 0.2  # diameters: closer modes are one object; touching objects' centres are farther apart
-_REACH = 0.25  # diameters: a vote farther from every mode belongs to none
+_SEED = 0.1  # diameters between the starting points of the mean shift
+_MERGE = 0.2  # diameters: closer modes are one object; the centres of touching objects are farther apart
+_REACH = 0.25  # diameters: a vote farther than this from every mode belongs to no object
 _ITERATIONS = 12
-_MOST_VOXELS = 1000  # that take part: enough for 40 objects, and an untrained network's votes cost no minutes
+_MOST_VOXELS = 1000  # enough for 40 objects; without a limit the votes of an untrained network would take minutes
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +32,13 @@ class Clusters:
 def cluster_votes(votes: np.ndarray, weight: np.ndarray, diameter: float, fewest: int = 12) -> Clusters:
     """Find the modes of votes for object centres, by mean shift.
 
-    The votes are first gathered into voxels, so that the cost depends on the number of objects, not of pixels.
+    Votes are first summed up in voxels, so that the cost depends on the number of objects and not of pixels.
 
     Args:
-        votes: (p, 3) metres.
-        weight: (p,) how much each vote is trusted.
-        diameter: of the object, metres.
-        fewest: votes that make a cluster.
+        votes: (p, 3) centres that the pixels vote for, metres.
+        weight: (p,) weight of each vote.
+        diameter: the object's, metres.
+        fewest: a cluster with fewer votes is dropped.
     """
     if len(votes) < fewest:
         return Clusters(np.zeros((0, 3)), np.full(len(votes), -1))
@@ -62,7 +62,7 @@ def cluster_votes(votes: np.ndarray, weight: np.ndarray, diameter: float, fewest
 def _mean_shift(
     seeds: np.ndarray, points: np.ndarray, mass: np.ndarray, bandwidth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(s, 3) where each seed ends up among weighted points, and the (s,) density there."""
+    """(s, 3) modes that the seeds converge to, and the (s,) density of the weighted points there."""
     for _ in range(_ITERATIONS):
         affinity = _affinity(seeds, points, bandwidth) * mass
         seeds = affinity @ points / affinity.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Depth image to smoothed points, normals and a mask of what may be an object (not table, floor or bin wall)."""
+"""From a depth image to smoothed points, normals and a mask of the foreground (not table, floor or bin wall)."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class Surface:
         depth: (H, W) smoothed metres, NaN invalid.
         points: (H, W, 3) metres, NaN invalid.
         normals: (H, W, 3) unit normals facing the camera, NaN where unknown.
-        foreground: (H, W) bool, has depth and lies on no large plane.
+        foreground: (H, W) bool, whether a pixel has depth and lies on no large plane.
     """
 
     camera: PinholeCamera
@@ -27,31 +27,31 @@ class Surface:
 
 
 def measure_surface(depth: np.ndarray, camera: PinholeCamera, object_diameter: float) -> Surface:
-    """Smooth a depth image within surfaces, not across edges, and set the bin and the table aside.
+    """Smooth a depth image within surfaces but not across edges, and separate bin and table from the foreground.
 
     Args:
-        depth: (H, W) metres, NaN invalid.
+        depth: (H, W) metres along z, NaN invalid.
         camera: intrinsics.
-        object_diameter: metres; a plane is background when it is larger than any object's face could be.
+        object_diameter: metres; planes larger than any face of an object are background.
     """
     smooth = smooth_within_surfaces(smooth_within_surfaces(depth.astype(np.float32), axis=0), axis=1)
     points = backproject(smooth, camera)
     normals = normals_from_points(points, reach=3)
     foreground = np.isfinite(smooth)
     for normal, offset in find_large_planes(points, normals, object_diameter):
-        # Only what lies flat on the plane: a wall's plane, extended, cuts through objects.
+        # Only surface with the plane's normal is background, because the plane of a wall may cut through objects.
         foreground &= ~((np.abs(points @ normal - offset) < 0.006) & (normals @ normal > 0.8))
     return Surface(camera, smooth, points, normals, foreground)
 
 
 def smooth_within_surfaces(depth: np.ndarray, axis: int, reach: int = 2, gate: float = 0.008) -> np.ndarray:
-    """Mean over the pixels up to ``reach`` away along one axis whose depth differs by less than ``gate`` metres.
+    """Smooth along one axis: the mean of neighbours whose depth differs by less than ``gate``.
 
     Args:
-        depth: (H, W) float32 metres, NaN invalid; invalid pixels stay so.
+        depth: (H, W) float32 metres, NaN invalid; invalid pixels stay invalid.
         axis: 0 down the columns, 1 along the rows.
-        reach: pixels.
-        gate: metres.
+        reach: how far neighbours may be away, pixels.
+        gate: largest difference in depth, metres.
     """
     total, count = depth.copy(), np.ones(depth.shape, np.float32)
     for shift in range(1, reach + 1):
@@ -71,17 +71,18 @@ def smooth_within_surfaces(depth: np.ndarray, axis: int, reach: int = 2, gate: f
 def find_large_planes(
     points: np.ndarray, normals: np.ndarray, object_diameter: float
 ) -> list[tuple[np.ndarray, float]]:
-    """Planes that hold more surface than an object's largest possible face, biggest first (sequential RANSAC, seeded).
+    """Find planes with more surface than the largest face of an object, by sequential RANSAC with a fixed seed.
 
-    One sample is a point with its normal, so a plane needs a single good draw.
+    A point with its normal defines a plane, so one good sample is enough.
 
     Args:
-        points: (H, W, 3) metres.
-        normals: (H, W, 3) facing the camera, NaN unknown.
+        points: (H, W, 3) in the optical frame, metres.
+        normals: (H, W, 3) unit normals facing the camera, NaN unknown.
         object_diameter: metres.
 
     Returns:
-        (unit normal float32 facing the camera, offset) pairs with ``normal . x = offset`` on the plane.
+        Pairs of a (3,) float32 unit normal facing the camera and an offset in metres, with ``normal . x = offset``.
+        The largest plane is first.
     """
     cell = points[::8, ::8].reshape(-1, 3), normals[::8, ::8].reshape(-1, 3)
     known = np.isfinite(cell[1]).all(axis=1) & np.isfinite(cell[0]).all(axis=1)

@@ -1,4 +1,4 @@
-"""The training-free estimator: needs a mesh and a depth image, nothing else."""
+"""The training-free estimator, which needs only a mesh and a depth image."""
 
 from dataclasses import dataclass
 
@@ -22,9 +22,9 @@ class GeometricParameters:
     """Settings of :class:`GeometricEstimator`.
 
     Attributes:
-        references: most scene points that vote; time grows with it.
-        refined: most candidates that are refined.
-        min_score: hypotheses scoring less are not reported, in [0, 1].
+        references: largest number of scene points that vote; the run time grows with it.
+        refined: largest number of candidates that are refined.
+        min_score: hypotheses with a lower score are not reported, in [0, 1].
 
     Raises:
         ValueError: a value is out of range.
@@ -42,9 +42,9 @@ class GeometricParameters:
 
 
 class GeometricEstimator:
-    """Point-pair voting, visible-surface ICP, judgement by free space and inliers, masks of explained pixels.
+    """Estimates poses by point-pair voting and visible-surface ICP, and scores them by inliers and free space.
 
-    Deterministic, single-threaded, uses only the depth image and its intrinsics.
+    It is deterministic and single-threaded, and uses only the depth image and its intrinsics.
     """
 
     def __init__(self, model: ObjectModel, parameters: GeometricParameters | None = None) -> None:
@@ -63,7 +63,7 @@ class GeometricEstimator:
         return self._report(surface, poses, view)
 
     def _propose(self, surface: Surface) -> np.ndarray:
-        """(k, 4, 4) distinct candidates that the depth image does not speak against, best first."""
+        """(k, 4, 4) distinct candidates with the best evidence in the depth image, best first."""
         usable = surface.foreground & np.isfinite(surface.normals).all(axis=-1)
         index = _thin_out(surface, usable, 0.05 * self.model.diameter)
         if len(index) < 10:
@@ -80,7 +80,7 @@ class GeometricEstimator:
         return poses[kept[: self.parameters.refined]]
 
     def _refine(self, surface: Surface, poses: np.ndarray) -> np.ndarray:
-        """(k, 4, 4) refined candidates without duplicates, best first."""
+        """(k, 4, 4) refined poses without duplicates, best first."""
         usable = np.isfinite(surface.normals).all(axis=-1) & surface.foreground
         usable[1::2] = usable[:, 1::2] = False
         scene, normals = cKDTree(surface.points[usable]), surface.normals[usable]
@@ -94,12 +94,12 @@ class GeometricEstimator:
         return poses[kept[value[kept] > 0.1]]
 
     def _report(self, surface: Surface, poses: np.ndarray, view: View) -> Hypotheses:
-        """Hypotheses whose pixels no better one explains."""
+        """The hypotheses that explain pixels which no better one explains."""
         if not len(poses):
             return Hypotheses.empty(view.camera.height, view.camera.width)
         score = _value(self._weigh(surface, poses, samples=512))
-        # By the area that a pose explains, not by its share: a mug turned so that its handle would be hidden fits
-        # perfectly, and leaves the handle that was measured unexplained.
+        # Ranked by the area that a pose explains and not by its share. A mug rotated so that its handle would be hidden
+        # fits perfectly, but leaves the measured handle unexplained.
         area = score * self._views.visible.sum(axis=1)[self._views.nearest_direction(poses)]
         best = np.argsort(-area, kind="stable")
         best = best[score[best] >= self.parameters.min_score]
@@ -119,7 +119,7 @@ def _value(evidence: Evidence) -> np.ndarray:
 
 
 def _thin_out(surface: Surface, usable: np.ndarray, spacing: float) -> np.ndarray:
-    """Flat indices of usable pixels, about one for each cube of that edge in metres."""
+    """Flat indices of usable pixels, one per cube of edge ``spacing`` metres."""
     index = np.flatnonzero(usable)
     cell = np.floor(surface.points.reshape(-1, 3)[index] / spacing).astype(np.int64)
     key = (cell[:, 0] * 4096 + cell[:, 1]) * 4096 + cell[:, 2]
@@ -134,5 +134,9 @@ def create_geometric(
     refined: int = GeometricParameters.refined,
     min_score: float = GeometricParameters.min_score,
 ) -> GeometricEstimator:
-    """Factory; see :class:`GeometricParameters`."""
+    """Factory of the estimator ``geometric``; see :class:`GeometricParameters` for the settings.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
     return GeometricEstimator(model, GeometricParameters(references, refined, min_score))

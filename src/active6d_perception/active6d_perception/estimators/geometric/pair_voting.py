@@ -1,9 +1,9 @@
-"""Pose candidates from point pairs: two oriented points on a surface fix a pose up to a match in the model.
+"""Pose candidates from pairs of oriented points, by voting.
 
-The voting scheme of Drost et al., "Model globally, match locally" (2010), cited by the paper as what works with
-handcrafted features. For a scene point and each of its neighbours within the object's size, the pair's distance and
-angles select model pairs alike; each says which model point the scene point is and how far the model is turned about
-its normal, and votes for that. A majority survives occlusion and needs no segmentation of touching, identical objects.
+The method is that of Drost et al., "Model globally, match locally" (2010), which the paper cites for handcrafted
+features. A scene point forms pairs with its neighbours within the object's diameter. Distance and angles of a pair
+select similar pairs of the model. Each of these votes for a model point and for a rotation about its normal.
+The method tolerates occlusion, and does not need a segmentation of touching identical objects.
 """
 
 import numpy as np
@@ -17,11 +17,11 @@ from active6d_perception.model.model_views import visible_from
 _MODEL_POINTS = 400
 _DISTANCE_BINS = 20  # of the diameter
 _ANGLE_BINS = 15  # of pi
-_TURN_BINS = 30  # of 2 pi
+_ROTATION_BINS = 30  # of 2 pi
 
 
 class PairVoting:
-    """The model's point pairs, found by their feature, and the voting over them."""
+    """Voting for poses with the point pairs of a model, which are indexed by their features."""
 
     def __init__(self, model: ObjectModel) -> None:
         points, faces = trimesh.sample.sample_surface_even(model.mesh, _MODEL_POINTS, seed=0)
@@ -31,7 +31,7 @@ class PairVoting:
         visible = visible_from(model.mesh, eyes, points, normals)
         first, second = np.nonzero((visible.T.astype(np.float32) @ visible.astype(np.float32)) > 0)
         if model.symmetry.axis is not None:
-            # Points on one circle about the axis are one reference point: keep a narrow wedge of them.
+            # Points on one circle about the axis are equivalent reference points: keep a narrow wedge of them.
             first, second = _keep_wedge(points, model.symmetry.axis, first, second)
         self._frames = _frames(points, normals)
         references = np.unique(first)
@@ -39,24 +39,24 @@ class PairVoting:
         feature, kept = self._features(points[first], normals[first], points[second], normals[second])
         first, second = first[kept], second[kept]
         order = np.argsort(feature, kind="stable")
-        turn = _turn(self._frames[first], points[second])
+        rotation = _angle_about_normal(self._frames[first], points[second])
         self._pair_reference = np.searchsorted(references, first[order]).astype(np.int32)
-        self._pair_rotation = turn[order].astype(np.float32)
+        self._pair_rotation = rotation[order].astype(np.float32)
         self._starts = np.searchsorted(feature[order], np.arange(_DISTANCE_BINS * _ANGLE_BINS**3 + 1))
 
     def candidates(
         self, points: np.ndarray, normals: np.ndarray, references: np.ndarray, peaks: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Poses that the surface around reference points votes for.
+        """The poses with the most votes at each reference point.
 
         Args:
-            points: (n, 3) scene points in the optical frame, metres, spaced about a twentieth of the diameter.
+            points: (n, 3) scene points in the optical frame, metres, about a twentieth of the diameter apart.
             normals: (n, 3) unit normals facing the camera.
-            references: (r,) indices of the points that vote.
-            peaks: poses per reference point.
+            references: (r,) indices of the reference points.
+            peaks: number of poses per reference point.
 
         Returns:
-            (r * peaks, 4, 4) ``T_camera_object`` and (r * peaks,) votes.
+            (r * peaks, 4, 4) ``T_camera_object``, metres, and (r * peaks,) their votes.
         """
         gap = np.linalg.norm(points[references][:, None] - points[None], axis=-1)
         row, column = np.nonzero((gap < self._diameter) & (gap > 0.05 * self._diameter))
@@ -64,29 +64,29 @@ class PairVoting:
         feature, kept = self._features(points[first], normals[first], points[column], normals[column])
         row, column = row[kept], column[kept]
         frames = _frames(points[references], normals[references])
-        turn = _turn(frames[row], points[column])
+        rotation = _angle_about_normal(frames[row], points[column])
         matches = self._starts[feature + 1] - self._starts[feature]
         pair = np.repeat(np.arange(len(row)), matches)
         offset = np.arange(len(pair)) - np.repeat(np.cumsum(matches) - matches, matches)
         model_pair = self._starts[feature][pair] + offset
-        difference = turn[pair] - self._pair_rotation[model_pair]
-        axis_rotation_bin = np.floor(difference * (_TURN_BINS / (2 * np.pi))).astype(np.int32) % _TURN_BINS
-        cells = len(self._reference_frames) * _TURN_BINS
-        index = (row[pair] * cells).astype(np.int64) + self._pair_reference[model_pair] * _TURN_BINS + axis_rotation_bin
-        votes = np.bincount(index, minlength=len(references) * cells).reshape(len(references), -1, _TURN_BINS)
+        difference = rotation[pair] - self._pair_rotation[model_pair]
+        rotation_bin = np.floor(difference * (_ROTATION_BINS / (2 * np.pi))).astype(np.int32) % _ROTATION_BINS
+        cells = len(self._reference_frames) * _ROTATION_BINS
+        index = (row[pair] * cells).astype(np.int64) + self._pair_reference[model_pair] * _ROTATION_BINS + rotation_bin
+        votes = np.bincount(index, minlength=len(references) * cells).reshape(len(references), -1, _ROTATION_BINS)
         votes = votes + 0.5 * (np.roll(votes, 1, axis=2) + np.roll(votes, -1, axis=2))
         votes = votes.reshape(len(references), -1)
         best = np.argpartition(votes, -peaks, axis=1)[:, -peaks:]
-        reference, axis_rotation_bin = np.divmod(best.ravel(), _TURN_BINS)
-        angle = (axis_rotation_bin + 0.5) * (2 * np.pi / _TURN_BINS)
-        turned = make_transform(Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 0.0]).as_matrix(), np.zeros(3))
-        poses = np.repeat(invert(frames), peaks, axis=0) @ turned @ self._reference_frames[reference]
+        reference, rotation_bin = np.divmod(best.ravel(), _ROTATION_BINS)
+        angle = (rotation_bin + 0.5) * (2 * np.pi / _ROTATION_BINS)
+        about_normal = make_transform(Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 0.0]).as_matrix(), np.zeros(3))
+        poses = np.repeat(invert(frames), peaks, axis=0) @ about_normal @ self._reference_frames[reference]
         return poses, np.take_along_axis(votes, best, axis=1).ravel()
 
     def _features(
         self, p1: np.ndarray, n1: np.ndarray, p2: np.ndarray, n2: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Quantised features (m,) of those of n pairs that are neither too close nor too far, and which: (n,) bool."""
+        """(m,) quantised features of the pairs with a usable distance, and (n,) bool, which these are."""
         d = p2 - p1
         distance = np.linalg.norm(d, axis=1)
         kept = (distance > 0.05 * self._diameter) & (distance < self._diameter)
@@ -119,7 +119,7 @@ def _frames(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return make_transform(R, -np.einsum("nij,nj->ni", R, points))
 
 
-def _turn(frames: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) angle about +x of (n, 3) points seen in (n, 4, 4) frames."""
+def _angle_about_normal(frames: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n,) angles about +x, radians, of (n, 3) points in (n, 4, 4) frames."""
     local = np.einsum("nij,nj->ni", frames[:, :3, :3], points) + frames[:, :3, 3]
     return np.arctan2(local[:, 2], local[:, 1])

@@ -1,4 +1,4 @@
-"""Other training views made of one. Mirroring is not among them: it makes another object."""
+"""Augmentation of training views. Views are never mirrored, because that would show another object."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE
 
 
 def augment(view: View, rng: np.random.Generator) -> View:
-    """Another colour balance, exposure, contrast and grain, and some depth missing or coarser."""
+    """Change colour balance, exposure, contrast and image noise; add noise to depth and remove some of it."""
     color = view.color.astype(np.float32) / 255
     color = color ** rng.uniform(0.7, 1.4) * rng.uniform(0.75, 1.25) * rng.uniform(0.85, 1.15, 3).astype(np.float32)
     if rng.random() < 0.15:
@@ -22,13 +22,13 @@ def augment(view: View, rng: np.random.Generator) -> View:
 
 
 def crop(sample: TrainingView, height: int, width: int, rng: np.random.Generator) -> TrainingView:
-    """A window of the view around a random object pixel: most of a view is table, which teaches little.
+    """Cut a window around a random object pixel. Most of a view shows the table, from which little is learned.
 
     Args:
-        sample: at least as large.
-        height: of the window at the network's input resolution, a multiple of its output stride; likewise ``width``.
-        width: see there.
-        rng: source of randomness.
+        sample: training view at the network's input resolution; a smaller one is returned whole.
+        height: of the window in pixels, a multiple of the network's output stride.
+        width: of the window in pixels, likewise.
+        rng: random generator.
     """
     on_object = np.argwhere(sample.instance >= 0)
     centre = on_object[rng.integers(len(on_object))] if len(on_object) else np.array(sample.instance.shape) // 2
@@ -50,7 +50,7 @@ def crop(sample: TrainingView, height: int, width: int, rng: np.random.Generator
 
 
 def _blobs(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    """(h, w) bool: a few ellipses in which depth is missing, as on shiny surfaces; none in half of the views."""
+    """(h, w) bool: a few ellipses of missing depth, as on shiny surfaces; half of the views have none."""
     hidden = np.zeros(shape, bool)
     for _ in range(rng.integers(1, 8) if rng.random() < 0.5 else 0):
         centre, radius = rng.uniform(0, shape), rng.uniform(2, 10, 2)

@@ -1,4 +1,4 @@
-"""Endless batches of inputs and targets from files of training views."""
+"""Batches of inputs and targets from files of training views, without end."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,14 +15,14 @@ from active6d_perception.estimators.dense.training.augmentation import augment, 
 from active6d_perception.estimators.dense.training.samples import read_shard
 from active6d_perception.estimators.dense.training.targets import Targets, make_targets
 
-#: Files read together; their views are mixed before they are used.
+#: Number of files read at a time; their views are shuffled together.
 _SHARDS_TOGETHER = 24
-#: Height and width of the part of a view that is learned from at a time; objects seldom cover more.
+#: Height and width in pixels of the window cut from each view; objects seldom cover more.
 _WINDOW = (160, 208)
 
 
 class TrainingViews(IterableDataset):
-    """Endless augmented (input, targets) in random order."""
+    """Augmented pairs of input and targets in random order, without end."""
 
     def __init__(
         self, shards: list[Path], canonical_frame: CanonicalFrame, diameter: float, seed: tuple[int, ...]
@@ -30,16 +30,16 @@ class TrainingViews(IterableDataset):
         """
         Args:
             shards: files of training views.
-            canonical_frame: of the object.
-            diameter: metres.
-            seed: of order and augmentation; a resumed training gives another one.
+            canonical_frame: the object's.
+            diameter: the object's, metres.
+            seed: seed of order and augmentation; a resumed training uses another one.
 
         Raises:
-            ValueError: there is no file.
+            ValueError: ``shards`` is empty.
         """
         if not shards:
             raise ValueError("there are no training views; render them with 'active6d train estimator --heaps N'")
-        self._shards, self._gauge, self._diameter, self._seed = shards, canonical_frame, diameter, seed
+        self._shards, self._canonical_frame, self._diameter, self._seed = shards, canonical_frame, diameter, seed
 
     def __iter__(self) -> Iterator[tuple[Tensor, Targets]]:
         worker = get_worker_info()
@@ -55,16 +55,16 @@ class TrainingViews(IterableDataset):
     def _prepare(self, sample: TrainingView, rng: np.random.Generator) -> tuple[Tensor, Targets]:
         sample = crop(sample, *_WINDOW, rng)
         view = augment(sample.view, rng)
-        return input_tensor(view, self._diameter), make_targets(sample, self._gauge, self._diameter)
+        return input_tensor(view, self._diameter), make_targets(sample, self._canonical_frame, self._diameter)
 
 
 def input_tensor(view, diameter: float) -> Tensor:
-    """The padded (channels, h, w) input of one reduced view."""
+    """The padded (channels, h, w) input of one view at the network's resolution."""
     return torch.from_numpy(pad(network_input(view, diameter)))
 
 
 def batches(views: TrainingViews, size: int, workers: int) -> Iterator[tuple[Tensor, list[Targets]]]:
-    """Endless batches; ``workers`` processes prepare them, or this one when 0."""
+    """Batches of ``size`` views without end; ``workers`` processes prepare them, or this process when 0."""
     return iter(
         DataLoader(views, batch_size=size, num_workers=workers, collate_fn=_collate, persistent_workers=workers > 0)
     )

@@ -1,4 +1,4 @@
-"""Training curves as a picture."""
+"""Drawing of training curves."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,14 +13,14 @@ _RATES = {
 
 
 def draw_curves(history: Sequence[dict[str, float]], path: Path, title: str) -> None:
-    """Draw rates found on the validation split, and the loss's terms (training solid, validation dashed), over steps.
+    """Draw the rates on the validation split and the terms of the loss (training and validation) over the steps.
 
     Args:
         history: one entry per validation, as in ``curves.json``.
-        path: PNG to write.
-        title: of the picture.
+        path: PNG file to write.
+        title: of the figure.
     """
-    from matplotlib.figure import Figure  # slow to import, and a training that never validates needs none of it
+    from matplotlib.figure import Figure  # slow to import, and not needed without a validation
 
     figure = Figure(figsize=(11, 7), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(3, 4))
@@ -31,7 +31,7 @@ def draw_curves(history: Sequence[dict[str, float]], path: Path, title: str) -> 
     rates.set(ylabel="rate on the validation split", ylim=(0, 1))
     rates.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     rates.grid(alpha=0.3)
-    # A panel for each term: their sizes differ by orders of magnitude.
+    # One panel per term, because their magnitudes differ by orders.
     terms = [key.removeprefix("training_") for key in history[0] if key.startswith("training_")]
     panels = below.subplots(2, -(-len(terms) // 2)).ravel()
     for unused in panels[len(terms) :]:

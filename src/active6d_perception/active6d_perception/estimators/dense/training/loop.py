@@ -1,4 +1,4 @@
-"""The training loop: resumable, with averaged weights, the best of which by validation is exported."""
+"""The training loop: resumable, with averaged weights, of which those best on the validation split are exported."""
 
 import json
 import math
@@ -37,21 +37,21 @@ _CLIP = 1.0  # norm of the gradient
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """How to train.
+    """Options of a training.
 
     Attributes:
-        steps: of the optimiser in all; the learning rate falls to zero until then.
+        steps: total number of optimiser steps, over which the learning rate falls to zero.
         batch: views per step.
-        learning_rate: at its highest, after the warm-up.
-        warmup: steps.
+        learning_rate: the highest learning rate, after the warm-up.
+        warmup: number of steps over which the learning rate rises.
         weight_decay: of AdamW.
-        averaging: weights are averaged exponentially with this factor per step.
-        checkpoint_every: steps; what an interruption costs at most.
-        validate_every: steps, a multiple of ``checkpoint_every``.
-        workers: processes that prepare batches.
-        seed: of initial weights, order and augmentation.
-        loss: weights of the loss's terms.
-        size: of the network.
+        averaging: factor per step of the exponential moving average of the weights.
+        checkpoint_every: steps between checkpoints; an interruption loses at most so many.
+        validate_every: steps between validations, a multiple of ``checkpoint_every``.
+        workers: number of processes that prepare batches.
+        seed: seed of initial weights, order and augmentation.
+        loss: weights of the terms of the loss.
+        size: channels of the network's layers.
 
     Raises:
         ValueError: a number is out of range.
@@ -80,13 +80,13 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class Report:
-    """What :func:`train` says after each step.
+    """Progress that :func:`train` reports after each step.
 
     Attributes:
-        step: steps done.
-        loss: of this step's batch.
-        terms: that it is the weighted sum of.
-        validation: the latest rates, empty before the first validation.
+        step: number of steps done.
+        loss: of this step's batch, the weighted sum of ``terms``.
+        terms: of the loss.
+        validation: rates of the latest validation, empty before the first one.
     """
 
     step: int
@@ -104,22 +104,22 @@ def train(
     device: str = "cpu",
     on_step: Callable[[Report], None] = lambda report: None,
 ) -> Path:
-    """Train, or go on with the training that ``folder`` holds.
+    """Train a network, or resume the training in ``folder``.
 
     Args:
         model: the object.
         shards: files of training views.
-        validation: samples to choose the best weights by.
+        validation: views by which the best weights are chosen, at the network's resolution.
         folder: for ``state.*`` (to resume), ``curves.json``, ``curves.png`` and ``best.*`` (the result).
         options: how to train.
-        device: of torch, ``cpu`` or ``cuda``.
-        on_step: told of every step.
+        device: torch device, ``cpu`` or ``cuda``.
+        on_step: called after every step.
 
     Returns:
         path of the best weights so far.
 
     Raises:
-        ValueError: there are no training views, or the folder's state is damaged or of other options.
+        ValueError: there are no training views, or the state in the folder is damaged or belongs to other options.
     """
     folder.mkdir(parents=True, exist_ok=True)
     canonical_frame = canonical_frame_of(model)
@@ -157,12 +157,12 @@ def train(
 
 
 def worth(validation: dict[str, float]) -> float:
-    """What the best weights are best in: objects found, whether well or barely visible, and few of them wrong."""
+    """Criterion for the best weights: high detection rates for well and barely visible objects, and high precision."""
     return validation["add_half"] + validation["add_tenth"] + validation["adds_tenth"] + 0.5 * validation["precision"]
 
 
 class _Run:
-    """Network, averaged network, optimiser and history, and their file."""
+    """State of a training: network, averaged network, optimiser and history, with the file that holds them."""
 
     def __init__(self, folder: Path, options: TrainingOptions, device: str) -> None:
         torch.manual_seed(options.seed)
@@ -182,7 +182,7 @@ class _Run:
         self._schedule = LambdaLR(self._optimizer, partial(_learning_rate_share, options), last_epoch=self.step - 1)
 
     def advance(self, inputs: Tensor, targets: list) -> dict[str, float]:
-        """One step of the optimiser; the loss's terms."""
+        """Do one step of the optimiser; returns the terms of the loss."""
         inputs = inputs.to(self._device, memory_format=torch.channels_last)
         with torch.autocast(self._device.type, torch.bfloat16, enabled=has_fast_bfloat16(self._device.type)):
             answer = self._network(inputs)
@@ -203,13 +203,13 @@ class _Run:
         return deepcopy(self._averaged.module).cpu().eval()
 
     def save(self) -> None:
-        """Write tensors and history; an interruption leaves the previous state."""
+        """Write tensors and history; the previous state stays if the writing is interrupted."""
         tensors = {f"network.{name}": tensor for name, tensor in self._network.state_dict().items()}
         tensors |= {f"averaged.{name}": tensor for name, tensor in self._averaged.module.state_dict().items()}
         for index, state in self._optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
         progress = {"step": self.step, "options": asdict(self._options), "history": self.history}
-        # Tensors and progress are one file, so that they never disagree.
+        # One file holds tensors and progress, so that they cannot disagree.
         contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
         with atomic_file(self._state_file) as unfinished:
             save_file(contiguous, unfinished, metadata={"progress": json.dumps(progress)})
@@ -219,7 +219,7 @@ class _Run:
             with safe_open(self._state_file, "pt") as file:
                 progress = json.loads(file.metadata()["progress"])
             if progress["options"] != json.loads(json.dumps(asdict(self._options))):
-                raise ValueError("it was begun with other options")
+                raise ValueError("it was started with other options")
             tensors = load_file(self._state_file, device=str(self._device))
             self._network.load_state_dict(_under(tensors, "network."))
             self._averaged.module.load_state_dict(_under(tensors, "averaged."))
@@ -233,7 +233,7 @@ class _Run:
         except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0]
             raise ValueError(
-                f"{self._state_file}: cannot go on with this training ({reason}); give another folder or delete it"
+                f"{self._state_file}: cannot resume this training ({reason}); give another folder or delete it"
             ) from error
 
 

@@ -1,4 +1,4 @@
-"""How wrong an answer of the network is."""
+"""The loss of the network's output."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from active6d_perception.estimators.dense.network import split
 from active6d_perception.estimators.dense.training.targets import Targets
 
-#: Logarithmic Laplace scales are kept in this range: 0.3 % to one diameter and a half.
+#: Range of the logarithm of Laplace scales: 0.3 % to 150 % of the diameter.
 SCALE_RANGE = (-5.8, 0.4)
 
 
@@ -31,16 +31,18 @@ class LossWeights:
 
 
 def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
-    """The terms of the loss, by the names of :class:`LossWeights`.
+    """Compute the terms of the loss, by the names of :class:`LossWeights`.
 
     ``centre``, ``coordinates`` and ``axis`` are mean distances ``e``, the first two in diameters. ``scale`` is the
-    negative log-likelihood ``e / b + 3 log b`` of an isotropic Laplace distribution in space whose scale b the network
-    tells, so it learns to say where it is unsure. The errors in it are held fixed: a likelihood that trained the points
-    as well would weigh each head by 1 / b, and what is learned first (the centre) would drown what is hard (the axis).
+    negative log-likelihood ``e / b + 3 log b`` of an isotropic Laplace distribution in space. The network predicts its
+    scale b, and so learns where its errors are large.
+
+    The likelihood trains b only: ``e`` is held fixed in it. Otherwise each head would be weighted by 1 / b, and heads
+    that are learned early (the centre) would outweigh difficult ones (the axis).
 
     Args:
-        answer: (n, channels, h, w), at least as large as the targets.
-        targets: of each view; all of one size.
+        answer: (n, channels, h, w) output of the network, at least as large as the targets.
+        targets: targets of each view, all of one size.
     """
     height, width = targets[0].mask.shape
     answer = answer[:, :, :height, :width].float()
@@ -70,7 +72,7 @@ def total(terms: dict[str, Tensor], weights: LossWeights) -> Tensor:
 
 
 def _line(axis: Tensor) -> Tensor:
-    """(p, 6) products xx, yy, zz, xy, yz, zx of (p, 3) vectors: the same for an axis and its opposite."""
+    """(p, 6) products xx, yy, zz, xy, yz, zx of (p, 3) vectors; an axis and its opposite have the same."""
     return torch.cat([axis * axis, axis * axis.roll(-1, dims=1)], dim=1)
 
 

@@ -1,4 +1,4 @@
-"""Training views at the network's resolution, and the files that hold them."""
+"""Files of training views at the network's resolution."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ _DEPTH_UNIT = 1e-4  # metres; 16 bits reach 6.5 m
 
 
 def make_sample(item: TrainingView) -> TrainingView:
-    """The training view at the network's input resolution; its truth must have the network's output resolution.
+    """Reduce a training view to the network's input resolution; its truth must have the output resolution already.
 
     Raises:
         ValueError: the truth has another size.

@@ -1,4 +1,4 @@
-"""What the network should have answered: closed-form targets per output pixel, from true depth, instances and poses."""
+"""Targets of the network's output, in closed form from true depth, instances and poses."""
 
 from dataclasses import dataclass
 
@@ -20,12 +20,12 @@ class Targets:
     Attributes:
         mask: (h, w) float32, 1 on objects.
         pixel: (p,) flat indices into (h, w).
-        weight: (p,) float32, mean 1. Instances count by the square root of their pixels, so that distant ones count,
-            and by their visible fraction, since nobody can tell the orientation of a sliver.
-        centre: (p, 3) float32, as the network's head of that name; likewise ``coordinates`` and ``axis``.
-        coordinates: (p, 3) float32.
-        axis: (p, 3) float32.
-        direction: (p, DIRECTION_BINS) float32 distribution over the sphere's bins; zero where nothing shows the turn.
+        weight: (p,) float32, mean 1. The weight of an instance grows with the root of its number of pixels, so that
+            distant ones matter, and with its visible fraction, because a sliver does not show the orientation.
+        centre: (p, 3) float32, see the network's head of this name.
+        coordinates: (p, 3) float32, see the head of this name.
+        axis: (p, 3) float32, see the head of this name.
+        direction: (p, DIRECTION_BINS) float32 distribution over the bins; zero where nothing shows the rotation.
     """
 
     mask: np.ndarray
@@ -38,12 +38,12 @@ class Targets:
 
 
 def make_targets(sample: TrainingView, canonical_frame: CanonicalFrame, diameter: float) -> Targets:
-    """Targets of one sample.
+    """Compute the targets of one training view.
 
     Args:
-        sample: with true depth, instances and poses.
-        canonical_frame: of the object.
-        diameter: of the object, metres.
+        sample: training view at the network's resolution.
+        canonical_frame: the object's.
+        diameter: the object's, metres.
     """
     camera = output_camera(sample.view.camera)
     pixel = np.flatnonzero((sample.instance >= 0) & np.isfinite(sample.surface_depth))
@@ -55,7 +55,7 @@ def make_targets(sample: TrainingView, canonical_frame: CanonicalFrame, diameter
     R_ray_camera = np.swapaxes(ray_rotation(T_axis[:, :3, 3]), 1, 2)
     to_canonical = invert(T_canonical)[instance]
     direction = np.zeros((len(T_axis), DIRECTION_BINS), np.float32)
-    if canonical_frame.turn is not AxisRotation.INVISIBLE:
+    if canonical_frame.axis_rotation is not AxisRotation.INVISIBLE:
         direction = kernel(np.einsum("nij,nj->ni", R_ray_camera, T_axis[:, :3, 0]))
     count = np.bincount(instance, minlength=len(T_axis))
     weight = (sample.visible_fraction / np.sqrt(np.maximum(count, 1)))[instance]

@@ -1,4 +1,4 @@
-"""What a half-trained network is worth: its loss and the objects that it finds, on views of the validation split."""
+"""Validation of a network during training: its loss and its detection rates on the validation split."""
 
 from collections.abc import Sequence
 
@@ -16,12 +16,12 @@ from active6d_perception.estimators.dense.training.batches import input_tensor
 from active6d_perception.estimators.dense.training.losses import loss_terms
 from active6d_perception.estimators.dense.training.targets import make_targets
 
-#: Visible fractions from which on an object has to be found, by the name of the rate.
+#: Visible fraction from which an object has to be found, by the name of the rate.
 _VISIBLE = {"half": 0.5, "tenth": 0.1}
 
 
 def validate(model: ObjectModel, trained: TrainedNetwork, samples: Sequence[TrainingView]) -> dict[str, float]:
-    """:func:`pose_rates` of a network, and ``loss_<term>`` without augmentation."""
+    """:func:`pose_rates` of a network, and its loss without augmentation as ``loss_<term>``."""
     return {**pose_rates(model, trained, samples), **_losses(model, trained, samples)}
 
 
@@ -31,18 +31,18 @@ def pose_rates(
     samples: Sequence[TrainingView],
     parameters: DenseParameters = DenseParameters(),
 ) -> dict[str, float]:
-    """Rates in [0, 1] over all views together.
+    """Detection rates and precision in [0, 1] over all views together.
 
     Args:
         model: the object.
         trained: its network.
-        samples: views with truth.
-        parameters: of the estimator around the network.
+        samples: training views at the network's resolution.
+        parameters: settings of the estimator that uses the network.
 
     Returns:
-        ``add_half``, ``add_tenth``: objects at least half or a tenth visible that are detected (e_ADD below 10 % of the
-        diameter); ``adds_half``, ``adds_tenth``: the same by ADD-S; ``precision``: hypotheses that are right, by
-        ADD-S where only a part of the object shows its turn.
+        ``add_half`` and ``add_tenth``: share detected (ADD below 10 % of the diameter) of the objects at least half or
+        a tenth visible. ``adds_half`` and ``adds_tenth``: the same by ADD-S. ``precision``: share of right hypotheses,
+        by ADD-S where only a named part shows the rotation about the axis.
     """
     estimator = DenseEstimator(model, trained, parameters)
     limit = DETECTION_FRACTION * model.diameter
@@ -56,7 +56,7 @@ def pose_rates(
         for name, table in errors.items():
             found[name].append(match(table, limit) >= 0)
         visible.append(sample.visible_fraction)
-        judged = "adds" if trained.canonical_frame.turn is AxisRotation.TOLD_BY_FEATURE else "add"
+        judged = "adds" if trained.canonical_frame.axis_rotation is AxisRotation.SHOWN_BY_FEATURE else "add"
         right += found[judged][-1].sum()
         reported += len(T)
     fraction = np.concatenate(visible)
@@ -69,7 +69,7 @@ def pose_rates(
 
 
 def _near_add_s(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, limit: float) -> np.ndarray:
-    """(k, n) ADD-S, ``inf`` for pairs whose origins are farther apart than an object below the limit could be."""
+    """(k, n) ADD-S, metres; ``inf`` for pairs whose origins are too far apart to be below the limit."""
     errors = np.full((len(T_est), len(T_gt)), np.inf)
     if len(T_est):
         near = cKDTree(T_est[:, :3, 3]).query_ball_point(T_gt[:, :3, 3], 4 * limit)
