@@ -13,6 +13,7 @@ TRAINING = {
     "active6d_agent.environment.throughput",
     "active6d_agent.evaluation.ablations",
     "active6d_agent.policies.attention.ppo",
+    "active6d_agent.policies.sb3",
 }
 BLOCK = """
 import importlib, sys

@@ -1,5 +1,9 @@
+from importlib.metadata import EntryPoint
+from types import SimpleNamespace
+
 import pytest
 
+import active6d_core.registry
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC, Registry
 
@@ -20,7 +24,7 @@ def test_auto_is_what_the_object_calls_for(makers):
 
 
 def test_a_built_in_part_is_imported_when_asked_for(makers):
-    with pytest.raises(ModuleNotFoundError, match="No module named 'no'"):
+    with pytest.raises(ValueError, match=r"^maker 'lazy' needs no, which is not installed$"):
         makers.create("lazy", load_object("mug"))
 
 
@@ -39,3 +43,44 @@ def test_refusals_name_the_part(makers):
     ):
         with pytest.raises(ValueError, match=message):
             makers.create("strict", load_object("mug"), **parameters)
+
+
+def entry_point(name, value, package="theirs"):
+    found = EntryPoint(name, value, "active6d.makers")
+    vars(found)["dist"] = SimpleNamespace(name=package, version="1.2")
+    return found
+
+
+@pytest.fixture
+def extended(monkeypatch):
+    """A registry, and what other packages declare."""
+
+    def make(*declared):
+        monkeypatch.setattr(active6d_core.registry, "entry_points", lambda group: list(declared))
+        return Registry("maker", str, {"lazy": "no.such.module"}, "active6d.makers")
+
+    return make
+
+
+def test_entry_points_add_parts(extended):
+    registry = extended(entry_point("theirs", "fractions:Fraction"), entry_point("broken", "no.such:thing"))
+    registry.register("mine")(lambda model: None)
+    assert registry.origins() == {"lazy": "built in", "theirs": "theirs 1.2", "broken": "theirs 1.2", "mine": __name__}
+    assert registry.names() == ["broken", "lazy", "mine", "theirs"]
+    with pytest.raises(ValueError, match=r"maker 'theirs' has no parameter 'size'; it has: numerator, denominator"):
+        registry.create("theirs", load_object("mug"), size=1)
+    with pytest.raises(ValueError, match=r"^maker 'broken' of theirs 1.2 \(no.such:thing\) cannot be imported"):
+        registry.create("broken", load_object("mug"))
+
+
+def test_entry_points_that_name_no_factory_are_refused(extended):
+    with pytest.raises(ValueError, match=r"^maker 'x' of theirs 1.2 \(sys:version\) cannot be called"):
+        extended(entry_point("x", "sys:version")).create("x", load_object("mug"))
+
+
+def test_two_parts_of_one_name_are_refused(extended):
+    for first in ("lazy", "x"):
+        registry = extended(entry_point("x", "a:b"), entry_point(first, "c:d", "others"))
+        message = f"'{first}': (built in|theirs 1.2) and others 1.2"
+        with pytest.raises(ValueError, match=message):
+            registry.names()

@@ -1,14 +1,28 @@
-"""Parts that are chosen by name, such as estimators and policies: those that come along, and those that others add."""
+"""Parts that are chosen by name, such as estimators and policies: built in, or added by other packages and modules.
+
+A package adds parts by entry points of the group ``active6d.estimators`` or ``active6d.policies``: the entry point's
+name is the part's name, its value a factory ``module:attribute``. A module adds parts by registering them when it is
+imported; the environment variable ``ACTIVE6D_IMPORT`` names such modules, separated by commas. Child processes and
+ROS nodes inherit it. Nothing else is imported, and a part's module only when parts are asked for.
+"""
 
 import inspect
-from collections.abc import Callable, Mapping
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from active6d_core.object_model import ObjectModel
 
 #: The name that stands for whatever is best for the object at hand.
 AUTOMATIC = "auto"
+#: Names modules to import, separated by commas.
+IMPORT_VARIABLE = "ACTIVE6D_IMPORT"
+#: What :meth:`Registry.origins` calls the parts of active6d itself.
+BUILT_IN = "built in"
 
 _Factory = TypeVar("_Factory", bound=Callable[..., Any])
 
@@ -19,14 +33,18 @@ class Registry:
     Args:
         kind: what the parts are called in messages.
         choose: from an object's name to the name that ``auto`` stands for.
-        built_in: module by name of the parts that come along. Modules register their parts when imported, and are
+        built_in: module by name of the parts of active6d itself. Modules register their parts when imported, and are
             imported when a part is asked for, so that a simple part does not wait for the libraries of a learned one.
+        group: of the entry points by which other packages add parts.
     """
 
-    def __init__(self, kind: str, choose: Callable[[str], str], built_in: Mapping[str, str]) -> None:
+    def __init__(
+        self, kind: str, choose: Callable[[str], str], built_in: Mapping[str, str], group: str | None = None
+    ) -> None:
         self._kind = kind
         self._choose = choose
         self._built_in = built_in
+        self._group = group
         self._factories: dict[str, Callable[..., Any]] = {}
 
     def register(self, name: str) -> Callable[[_Factory], _Factory]:
@@ -44,22 +62,33 @@ class Registry:
         return register
 
     def names(self) -> list[str]:
-        """All names, which ``auto`` is none of."""
-        return sorted(self._built_in.keys() | self._factories.keys())
+        """All names, which ``auto`` is none of.
+
+        Raises:
+            ValueError: a module of ``ACTIVE6D_IMPORT`` cannot be imported, or two parts have one name.
+        """
+        return sorted(self.origins())
+
+    def origins(self) -> dict[str, str]:
+        """Every name and where its part comes from: "built in", the package with its version, or the module.
+
+        Raises:
+            ValueError: as :meth:`names`.
+        """
+        import_extensions()
+        modules = {name: factory.__module__ for name, factory in self._factories.items()}
+        packages = {name: _distribution(entry_point) for name, entry_point in self._entry_points.items()}
+        return modules | packages | dict.fromkeys(self._built_in, BUILT_IN)
 
     def create(self, name: str, model: ObjectModel, **parameters: Any) -> Any:
         """Make the part of that name, or with ``auto`` the chosen one, for one object.
 
         Raises:
-            ValueError: no such part, no such parameter, or what the factory refuses; the message names it.
+            ValueError: no such part, no such parameter, a library that is missing, or what the factory refuses; the
+                message names it.
         """
-        if name == AUTOMATIC:
-            name = self._choose(model.name)
-        if name not in self._factories and name in self._built_in:
-            import_module(self._built_in[name])
-        if name not in self._factories:
-            raise ValueError(f"unknown {self._kind} '{name}'; known: {', '.join([AUTOMATIC, *self.names()])}")
-        factory = self._factories[name]
+        name = self._choose(model.name) if name == AUTOMATIC else name
+        factory = self._factory(name)
         accepted = [parameter for parameter in inspect.signature(factory).parameters if parameter != "model"]
         unknown = sorted(parameters.keys() - set(accepted))
         if unknown:
@@ -69,3 +98,89 @@ class Registry:
             return factory(model, **parameters)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{self._kind} '{name}': {error}") from error
+
+    def _factory(self, name: str) -> Callable[..., Any]:
+        if name not in self._factories and name in self._built_in:
+            try:
+                import_module(self._built_in[name])
+            except ModuleNotFoundError as error:
+                raise ValueError(f"{self._kind} '{name}' needs {error.name}, which is not installed") from error
+        if name not in self._factories:
+            import_extensions()
+        if name not in self._factories and name in self._entry_points:
+            self._load(self._entry_points[name])
+        if name not in self._factories:
+            raise ValueError(f"unknown {self._kind} '{name}'; known: {', '.join([AUTOMATIC, *self.names()])}")
+        return self._factories[name]
+
+    def _load(self, entry_point: EntryPoint) -> None:
+        """Load the factory that an entry point names; its module may have registered it itself.
+
+        Raises:
+            ValueError: it cannot be imported, or is no factory.
+        """
+        where = f"{self._kind} '{entry_point.name}' of {_distribution(entry_point)} ({entry_point.value})"
+        try:
+            factory = entry_point.load()
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"{where} cannot be imported: {error}") from error
+        if not callable(self._factories.setdefault(entry_point.name, factory)):
+            del self._factories[entry_point.name]
+            raise ValueError(f"{where} cannot be called; an entry point names a factory, as in module:Class")
+
+    @cached_property
+    def _entry_points(self) -> dict[str, EntryPoint]:
+        found: dict[str, EntryPoint] = {}
+        for entry_point in entry_points(group=self._group) if self._group else ():
+            first = BUILT_IN if entry_point.name in self._built_in else None
+            if entry_point.name in found:
+                first = _distribution(found[entry_point.name])
+            if first is not None and first != _distribution(entry_point):
+                raise ValueError(
+                    f"two parts are called {self._kind} '{entry_point.name}': {first} and "
+                    f"{_distribution(entry_point)}; rename or uninstall one"
+                )
+            found[entry_point.name] = entry_point
+        return found
+
+
+def request_imports(modules: Iterable[str]) -> None:
+    """Import these modules wherever parts are asked for: in this process, its children and their ROS nodes.
+
+    Args:
+        modules: dotted names; found where ``python -m`` finds modules, in the current folder among others.
+    """
+    wanted = _requested_modules()
+    wanted += [module for module in modules if module not in wanted]
+    if not wanted:
+        return
+    os.environ[IMPORT_VARIABLE] = ",".join(wanted)
+    here = os.getcwd()
+    if here not in sys.path and "" not in sys.path:
+        sys.path.append(here)
+    paths = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    if here not in paths:
+        os.environ["PYTHONPATH"] = os.pathsep.join([*paths, here])
+
+
+def import_extensions() -> None:
+    """Import the modules that ``ACTIVE6D_IMPORT`` names.
+
+    Raises:
+        ValueError: one cannot be imported; the message names it.
+    """
+    for module in _requested_modules():
+        if module not in sys.modules:
+            try:
+                import_module(module)
+            except ImportError as error:
+                raise ValueError(f"module {module} (--import or {IMPORT_VARIABLE}): {error}") from error
+
+
+def _requested_modules() -> list[str]:
+    return [module.strip() for module in os.environ.get(IMPORT_VARIABLE, "").split(",") if module.strip()]
+
+
+def _distribution(entry_point: EntryPoint) -> str:
+    """The package that declares an entry point, with its version."""
+    return f"{entry_point.dist.name} {entry_point.dist.version}" if entry_point.dist else entry_point.value

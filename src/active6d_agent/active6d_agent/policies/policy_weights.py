@@ -21,20 +21,21 @@ def save_weights(module: nn.Module, path: Path, policy: str, config: dict, prove
     write_file(path.with_suffix(".json"), json.dumps(document, indent=2) + "\n")
 
 
-def load_weights(path: Path, policy: str, build: Callable[[dict], _Module]) -> _Module:
+def load_weights(path: Path, policy: str, build: Callable[[dict], _Module], remedy: str = "") -> _Module:
     """Read what :func:`save_weights` wrote.
 
     Args:
         path: of the ``.safetensors``.
         policy: whose weights they must be.
         build: configuration to a module of that shape; may raise what it likes.
+        remedy: how such weights are made; by default the command that trains the policy.
 
     Raises:
         ValueError: a file is missing, damaged or does not fit; one line that names the file and what to do.
     """
-    train = f"active6d train policy --object NAME --policy {policy} --export DIR"
+    remedy = remedy or f"train them with: active6d train policy --object NAME --policy {policy} --export DIR"
     if not path.is_file():
-        raise ValueError(f"{path}: no weights of the {policy} policy here; train them with: {train}")
+        raise ValueError(f"{path}: no weights of the {policy} policy here; {remedy}")
     try:
         config = json.loads(path.with_suffix(".json").read_text())
         if config["policy"] != policy:
@@ -43,5 +44,5 @@ def load_weights(path: Path, policy: str, build: Callable[[dict], _Module]) -> _
         module.load_state_dict(load_file(path))
     except Exception as error:  # safetensors and torch raise their own kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"{path}: no weights of the {policy} policy ({reason}); train them with: {train}") from error
+        raise ValueError(f"{path}: no weights of the {policy} policy ({reason}); {remedy}") from error
     return module.eval()

@@ -127,12 +127,16 @@ _registry = Registry(
         **dict.fromkeys(_BASELINES, "active6d_agent.policies.baselines"),
         "attention": "active6d_agent.policies.attention.network",
         "view-attention": "active6d_agent.policies.view_attention.network",
+        "sb3": "active6d_agent.policies.sb3",
     },
+    "active6d.policies",
 )
 #: Decorates a factory ``(model, **parameters) -> Policy``; see :meth:`active6d_core.registry.Registry.register`.
 register_policy = _registry.register
 #: Names that :func:`create_policy` knows beside ``auto``.
 list_policies = _registry.names
+#: Those names with where each policy comes from; see :meth:`active6d_core.registry.Registry.origins`.
+policy_origins = _registry.origins
 
 
 def create_policy(name: str, model: ObjectModel, **parameters: Any) -> Policy:

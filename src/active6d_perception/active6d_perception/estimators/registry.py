@@ -40,11 +40,14 @@ _registry = Registry(
         "dense": "active6d_perception.estimators.dense.dense_estimator",
         "geometric": "active6d_perception.estimators.geometric.geometric_estimator",
     },
+    "active6d.estimators",
 )
 #: Decorates a factory ``(model, **parameters) -> Estimator``; see :meth:`active6d_core.registry.Registry.register`.
 register_estimator = _registry.register
 #: Names of all estimators, without ``auto``.
 list_estimators = _registry.names
+#: Those names with where each estimator comes from; see :meth:`active6d_core.registry.Registry.origins`.
+estimator_origins = _registry.origins
 
 
 def create_estimator(name: str, model: ObjectModel, **parameters: Any) -> Estimator:

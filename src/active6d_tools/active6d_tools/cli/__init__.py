@@ -5,7 +5,7 @@ import sys
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from active6d_tools.cli import (
@@ -18,6 +18,7 @@ from active6d_tools.cli import (
     episode,
     estimate,
     evaluate,
+    list_parts,
     objects,
     replay,
     report,
@@ -55,6 +56,22 @@ class CommandGroup(TyperGroup):
         raise typer.Exit(2) from error
 
 
+class PartsCommand(TyperCommand):
+    """A command whose help names all policies or estimators where its texts say {policies} or {estimators}."""
+
+    def format_help(self, ctx: typer.Context, formatter: Any) -> None:
+        """Fill in the names, which are found only now: finding them imports the packages."""
+        from active6d_agent.policies.registry import list_policies
+        from active6d_perception.estimators.registry import list_estimators
+
+        for parameter in self.params:
+            text = getattr(parameter, "help", None) or ""
+            for kind, names in (("{policies}", list_policies), ("{estimators}", list_estimators)):
+                if kind in text:
+                    parameter.help = text.replace(kind, ", ".join(names()))
+        super().format_help(ctx, formatter)
+
+
 app = typer.Typer(
     cls=CommandGroup,
     invoke_without_command=True,
@@ -75,18 +92,19 @@ def show_help(ctx: typer.Context) -> None:
 
 
 app.command()(doctor.doctor)
-app.command()(episode.episode)
-app.command()(estimate.estimate)
-app.command()(replay.replay)
+app.command(cls=PartsCommand)(episode.episode)
+app.command(cls=PartsCommand)(estimate.estimate)
+app.command(cls=PartsCommand)(replay.replay)
 app.command()(report.report)
-app.command()(bank.bank)
-app.command()(evaluate.evaluate)
-app.command()(ablate.ablate)
+app.command(cls=PartsCommand)(bank.bank)
+app.command(cls=PartsCommand)(evaluate.evaluate)
+app.command(cls=PartsCommand)(ablate.ablate)
+app.command("list")(list_parts.list_parts)
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
 benchmark.app.command()(benchmark_estimator.estimator)
 benchmark.app.command()(benchmark_agent.environment)
-benchmark.app.command()(benchmark_agent.pipeline)
+benchmark.app.command(cls=PartsCommand)(benchmark_agent.pipeline)
 app.add_typer(benchmark.app, name="benchmark")
 train_estimator.app.command()(train_policy.policy)
 app.add_typer(train_estimator.app, name="train")

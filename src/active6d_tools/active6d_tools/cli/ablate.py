@@ -10,6 +10,7 @@ import typer
 from active6d_tools.cli.options import (
     LEARNED,
     Banks,
+    Imports,
     JsonFile,
     ObjectName,
     PolicyParameters,
@@ -48,7 +49,7 @@ _AGAIN = 1
 #: Trainings of each learned policy that ``seeds`` compares.
 _SEEDS = 3
 _OUT = "Folder of the trainings; by default in the cache folder."
-_POLICIES = "Policies that choose the views; verification and fusion use only the first one."
+_POLICIES = "Policies that choose the views: {policies}; verification and fusion use only the first one."
 
 
 def ablate(
@@ -63,6 +64,7 @@ def ablate(
     override: PolicyParameters = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help=_OUT)] = None,
     png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the figure to this PNG file.")] = None,
+    imports: Imports = None,
     banks: Banks = None,
     seed: Seed = 0,
     json_file: JsonFile = None,

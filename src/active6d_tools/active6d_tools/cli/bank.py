@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from active6d_tools.cli.options import Banks, JsonFile, ObjectName, Seed
+from active6d_tools.cli.options import Banks, Imports, JsonFile, ObjectName, Seed
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.terminal import console, progress_bar
 
@@ -13,11 +13,12 @@ from active6d_tools.cli.terminal import console, progress_bar
 def bank(
     object_name: ObjectName = "mug",
     split: Annotated[str, typer.Option(help="Split of the stored scenes: train, val or test.")] = "test",
-    estimator: Annotated[str, typer.Option(help="Estimator that finds the poses in each view.")] = "auto",
+    estimator: Annotated[str, typer.Option(help="Estimator for each view: auto, {estimators}.")] = "auto",
     scenes: Annotated[int | None, typer.Option(min=1, help="Number of stored scenes; by default all.")] = None,
     heaps: Annotated[int, typer.Option(min=0, help="Number of additional simulated piles; for train and val.")] = 0,
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the noise of the simulated sensor.")] = 1.0,
     workers: Annotated[int, typer.Option(min=0, help="Number of processes; 0 for one per core.")] = 0,
+    imports: Imports = None,
     banks: Banks = None,
     seed: Seed = 0,
     json_file: JsonFile = None,

@@ -38,7 +38,7 @@ def environment(
 
 def pipeline(
     object_name: ObjectName = "mug",
-    policy: Annotated[str, typer.Option(help="Who chooses the views.")] = "view-attention",
+    policy: Annotated[str, typer.Option(help="Policy that chooses the views: {policies}.")] = "view-attention",
     repeats: Annotated[int, typer.Option(min=1, help="Of every measurement.")] = 50,
     png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw costs over hypotheses into this PNG.")] = None,
     seed: Seed = 0,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from active6d_tools.cli.options import (
+    Imports,
     JsonFile,
     NodeParameters,
     ObjectName,
@@ -25,10 +26,12 @@ if TYPE_CHECKING:
 def episode(
     object_name: ObjectName = "mug",
     seed: Seed = 0,
-    policy: Annotated[str, typer.Option(help="Who chooses the views.")] = "auto",
+    policy: Annotated[str, typer.Option(help="Policy that chooses the views: auto, {policies}.")] = "auto",
     steps: Annotated[int, typer.Option(min=0, help="Budget of moves T; T moves are T + 1 images.")] = 5,
     metres: Annotated[float | None, typer.Option(min=0.0, help="Budget of metres along the hemisphere.")] = None,
-    estimator: Annotated[str | None, typer.Option(help="Who finds poses in one view; the params file's.")] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="Estimator: auto, {estimators}; by default that of the params file.")
+    ] = None,
     scene: Annotated[
         str | None, typer.Option(metavar="NAME", help="A stored scene such as mug/test/3 instead of a heap by seed.")
     ] = None,
@@ -45,6 +48,7 @@ def episode(
     processes: Processes = False,
     params_file: ParamsFile = None,
     override: NodeParameters = None,
+    imports: Imports = None,
     json_file: JsonFile = None,
 ) -> None:
     """Let the graph look at a heap, think and move, once: the same seed gives the same episode.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from active6d_core.files import write_file
-from active6d_tools.cli.options import JsonFile, ObjectName
+from active6d_tools.cli.options import Imports, JsonFile, ObjectName
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
@@ -29,7 +29,7 @@ def estimate(
     depth_scale: Annotated[
         float | None, typer.Option(min=0.0, help="Metres per unit of --depth; 0.001 for integers, else 1.")
     ] = None,
-    estimator: Annotated[str, typer.Option(help="Estimator that finds the poses.")] = "auto",
+    estimator: Annotated[str, typer.Option(help="Estimator that finds the poses: auto, {estimators}.")] = "auto",
     depth_range: Annotated[
         tuple[float, float] | None,
         typer.Option("--range", metavar="NEAR FAR", help="Use only these distances, metres."),
@@ -41,6 +41,7 @@ def estimate(
     object_id: Annotated[int, typer.Option(min=1, help="BOP's number of the object, for the CSV file.")] = 1,
     min_score: Annotated[float, typer.Option(min=0.0, max=1.0, help="Draw only hypotheses of at least it.")] = 0.5,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")] = Path("estimates"),
+    imports: Imports = None,
     json_file: JsonFile = None,
 ) -> None:
     """Estimate the poses of an object in recorded images.

@@ -6,6 +6,7 @@ import typer
 
 from active6d_tools.cli.options import (
     Banks,
+    Imports,
     JsonFile,
     ObjectName,
     PolicyParameters,
@@ -22,7 +23,9 @@ if TYPE_CHECKING:
 
 #: What the others are compared with in a table of its own.
 _DEFAULT = "view-attention"
-Policies = Annotated[str, typer.Option(help="Names separated by commas, or all; oracle and all-views are bounds.")]
+Policies = Annotated[
+    str, typer.Option(help="Names separated by commas, or all: {policies}; and the bounds oracle and all-views.")
+]
 
 
 def evaluate(
@@ -32,6 +35,7 @@ def evaluate(
     split: Annotated[str, typer.Option(help="Which bank: train, val or test.")] = "test",
     sample: Sample = None,
     override: PolicyParameters = None,
+    imports: Imports = None,
     banks: Banks = None,
     seed: Seed = 0,
     json_file: JsonFile = None,

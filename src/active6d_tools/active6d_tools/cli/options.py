@@ -32,6 +32,27 @@ Sample = Annotated[
     int | None, typer.Option(min=1, help="Number of starts, sampled with --seed; by default all of them.")
 ]
 
+
+def _import_modules(modules: list[str] | None) -> list[str]:
+    if modules:
+        from active6d_core.registry import import_extensions, request_imports
+
+        request_imports(modules)
+        import_extensions()
+    return modules or []
+
+
+#: Takes effect when the command line is read; the commands need not look at it.
+Imports = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--import",
+        metavar="MODULE",
+        callback=_import_modules,
+        help="Import a Python module that registers estimators or policies; repeatable.",
+    ),
+]
+
 #: In the order of the table that ``active6d evaluate`` prints.
 ALL_POLICIES = (
     *("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score", "attention"),
@@ -70,9 +91,13 @@ def usable_policies(text: str, bank: "SceneBank", parameters: dict[str, dict]) -
         ValueError: an unknown name, a wrong parameter, or a policy asked for by name that has no weights.
     """
     from active6d_agent.evaluation.policy_evaluation import BOUNDS
-    from active6d_agent.policies.registry import create_policy
+    from active6d_agent.policies.registry import create_policy, policy_origins
+    from active6d_core.registry import BUILT_IN
 
-    names = list(ALL_POLICIES) if text == "all" else [name.strip() for name in text.split(",")]
+    names = [name.strip() for name in text.split(",")]
+    if text == "all":
+        added = [name for name, origin in policy_origins().items() if origin != BUILT_IN]
+        names = [*ALL_POLICIES[: -len(BOUNDS)], *sorted(added), *BOUNDS]
     usable = []
     for name in names:
         try:

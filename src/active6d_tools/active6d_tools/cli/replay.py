@@ -7,6 +7,7 @@ import typer
 from active6d_tools.cli.options import (
     BagFolder,
     BagObject,
+    Imports,
     JsonFile,
     NodeParameters,
     ParamsFile,
@@ -30,10 +31,13 @@ def replay(
         bool, typer.Option("--compare", help="Exit with 1 unless hypotheses and objects equal the recorded ones.")
     ] = False,
     object_name: BagObject = None,
-    estimator: Annotated[str | None, typer.Option(help="Another estimator than the recorded one.")] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="Another estimator than the recorded one: auto, {estimators}.")
+    ] = None,
     processes: Processes = False,
     params_file: ParamsFile = None,
     override: NodeParameters = None,
+    imports: Imports = None,
     json_file: JsonFile = None,
 ) -> None:
     """Send a bag's camera through live perception.
