@@ -4,6 +4,7 @@ import gc
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,19 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from hypothesis import given
 from hypothesis import strategies as st
+from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_harness import fresh_domain, reliable
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from active6d_core.ros.conversions import MessageError, depth_to_image, image_to_depth, stamp_to_ns
+from active6d_core.ros.conversions import MessageError, OutdatedError, depth_to_image, image_to_depth, stamp_to_ns
+from active6d_core.ros.heartbeat import Awaited, Watch
 from active6d_core.ros.node import GraphNode, StampSynchronizer
+from active6d_core.ros.parameters import describe_limits
 
 
 class DepthNode(GraphNode):
@@ -28,16 +34,24 @@ class DepthNode(GraphNode):
         super().__init__("depth_node", **kwargs)
         self.declare("gain", 1.0, "factor", minimum=0.0, maximum=10.0)
         self.declare("mode", "mean", "what to publish", choices=("mean", "max"))
+        self.declare("count", 1, "how many", minimum=1)
         self.result = self.output(String, "result", latched=True)
         self.input(Image, "depth", self.on_depth, latched=True)
         self.fail_at_setup = False
+        self.wanted = None
+
+    def awaited(self):
+        return self.wanted
 
     def setup(self):
         if self.fail_at_setup:
             raise ValueError("mesh missing.ply does not exist")
+        self.gain = self.value("gain")
 
     def on_depth(self, message):
         depth = image_to_depth(message)
+        if depth.shape == (2, 1):
+            raise OutdatedError("it is over")
         if depth.shape == (1, 1):
             raise ZeroDivisionError("a defect in the node")
         with self.measure(stamp_to_ns(message.header.stamp)):
@@ -56,6 +70,160 @@ class DepthNode(GraphNode):
 def test_bad_parameters_are_named(graph, overrides, text):
     with pytest.raises(ValueError, match=text):
         DepthNode(context=graph.context, overrides=overrides)
+
+
+def test_limits_are_descriptor_ranges(graph):
+    node = graph.add(DepthNode(context=graph.context), start=False)
+    (gain,) = node.describe_parameter("gain").floating_point_range
+    assert (gain.from_value, gain.to_value) == (0.0, 10.0)
+    assert node.describe_parameter("mode").additional_constraints == "one of mean, max"
+    (count,) = node.describe_parameter("count").integer_range
+    assert (count.from_value, count.to_value) == (1, 2**63 - 1)
+    limits = {name: describe_limits(node.describe_parameter(name)) for name in ("gain", "mode", "count", "autostart")}
+    assert limits == {"gain": ">= 0.0; <= 10.0", "mode": "one of mean, max", "count": ">= 1", "autostart": ""}
+
+
+def set_parameter(graph, name, value):
+    """What `ros2 param set` does; the reason for a refusal, empty if the value was taken."""
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+    (result,) = graph.call(SetParameters, "depth_node/set_parameters", request).results
+    assert result.successful == (not result.reason)
+    return result.reason
+
+
+def test_a_parameter_can_be_set_until_the_node_is_configured(graph):
+    node = graph.add(DepthNode(context=graph.context), start=False)
+    assert set_parameter(graph, "gain", 3.0) == ""
+    node.start()
+    assert node.gain == 3.0
+    assert "'gain' can be set only while the node is unconfigured" in set_parameter(graph, "gain", 4.0)
+    node.trigger_deactivate()
+    assert "`ros2 lifecycle set /depth_node deactivate`" in set_parameter(graph, "gain", 4.0)
+    node.trigger_cleanup()
+    assert set_parameter(graph, "gain", 4.0) == ""
+    node.start()
+    assert node.gain == 4.0
+
+
+def test_a_failed_setup_leaves_the_parameters_settable(graph):
+    node = graph.add(DepthNode(context=graph.context), start=False)
+    node.fail_at_setup = True
+    node.trigger_configure()
+    assert set_parameter(graph, "gain", 4.0) == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("gain", 11.0, "out of range"),
+        ("gain", float("nan"), "out of range"),
+        ("gain", 1, "Wrong parameter type"),
+        ("mode", "median", "'mode' is 'median', must be one of mean, max"),
+        ("autostart", False, "read-only"),
+    ],
+)
+def test_bad_values_are_refused_on_set(graph, name, value, reason):
+    node = graph.add(DepthNode(context=graph.context), start=False)
+    before = node.value(name)
+    assert reason in set_parameter(graph, name, value)
+    assert node.value(name) == before
+
+
+def heartbeats(graph, node, text, timeout=10.0):
+    """Beat until a heartbeat holds the text; its status."""
+    found = graph.mailbox(DiagnosticArray, "/diagnostics")
+    statuses = []
+
+    def beaten():
+        node.beat()
+        statuses[:] = [s for message in found for s in message.status if text in s.message]
+        return statuses
+
+    graph.spin_until(beaten, timeout, text)
+    return statuses[0]
+
+
+def test_the_heartbeat_comes_every_second_without_input(graph):
+    graph.add(DepthNode(context=graph.context, overrides={"heartbeat": 0.1}), start=False)
+    found = graph.mailbox(DiagnosticArray, "/diagnostics")
+    graph.spin_until_filled([found], 3)
+    assert {message.status[0].message for message in found} == {"unconfigured, waiting for a lifecycle transition"}
+
+
+def test_the_heartbeat_can_be_off(graph):
+    graph.add(DepthNode(context=graph.context, overrides={"heartbeat": 0.0}))
+    found = graph.mailbox(DiagnosticArray, "/diagnostics")
+    graph.spin_for(1.3)
+    assert found == []
+
+
+def test_the_heartbeat_names_what_is_awaited_and_since_when(graph):
+    node = graph.add(DepthNode(context=graph.context))
+    now = [100.0]
+    node._watch = Watch(node, lambda: now[0])
+    publisher = graph.node.create_publisher(Image, "depth", reliable(True))
+    graph.spin_until(lambda: node.count_publishers("depth"))
+    node.wanted = Awaited(("depth",), 12_400_000_000)
+    node.beat()
+    now[0] += 7.0
+    status = heartbeats(graph, node, "waiting for depth of 12.400 s for 7 s")
+    assert status.level == DiagnosticStatus.OK  # somebody publishes it: it may just take its time
+    values = {pair.key: pair.value for pair in status.values}
+    assert (values["waiting_for"], values["waiting_s"]) == ("/depth", "7")
+    node.wanted = Awaited(("depth",), 13_000_000_000)
+    assert heartbeats(graph, node, "13.000").message == "waiting for depth of 13.000 s for 0 s"
+    graph.node.destroy_publisher(publisher)
+
+
+def test_a_topic_without_publisher_is_a_warning_that_names_it_once(graph):
+    node = graph.add(DepthNode(context=graph.context))
+    logged = graph.mailbox(Log, "/rosout")
+    now = [100.0]
+    node._watch = Watch(node, lambda: now[0])
+    node.wanted = Awaited(("depth",))
+    node.beat()
+    now[0] += 4.0
+    assert heartbeats(graph, node, "for 4 s").level == DiagnosticStatus.OK
+    now[0] += 2.0
+    status = heartbeats(graph, node, "for 6 s")
+    assert status.level == DiagnosticStatus.WARN
+    cause = f"nobody publishes depth in namespace / and domain {graph.domain}"
+    assert status.message == f"waiting for depth for 6 s: {cause}"
+    for _ in range(3):
+        node.beat()
+    graph.spin_until(lambda: any(cause in entry.msg for entry in logged))
+    graph.spin_for(0.2)
+    assert sum(cause in entry.msg for entry in logged) == 1
+
+
+def test_an_incompatible_publisher_is_named_as_the_cause(graph):
+    node = graph.add(DepthNode(context=graph.context))
+    logged = graph.mailbox(Log, "/rosout")
+    graph.node.create_publisher(Image, "depth", QoSProfile(depth=1, durability=DurabilityPolicy.VOLATILE))
+    cause = "a publisher of depth offers an incompatible QoS (durability)"
+    graph.spin_until(lambda: any(cause in entry.msg for entry in logged))
+    now = [time.monotonic()]
+    node._watch._clock = lambda: now[0]
+    node.wanted = Awaited(("depth",))
+    node.beat()
+    now[0] += 6.0
+    status = heartbeats(graph, node, cause)
+    assert status.level == DiagnosticStatus.WARN
+
+
+def test_messages_of_the_past_are_no_error_but_the_cause_of_waiting(graph):
+    node = graph.add(DepthNode(context=graph.context))
+    now = [100.0]
+    node._watch = Watch(node, lambda: now[0])
+    node.wanted = Awaited(("depth",), 5_000_000_000)
+    node.beat()
+    now[0] += 6.0
+    found = graph.mailbox(DiagnosticArray, "/diagnostics")
+    old = depth_to_image(np.ones((2, 1), np.float32), 1_000_000_000, "c")  # see on_depth
+    graph.publish("depth", old, latched=True)
+    graph.spin_until(lambda: any("ignored depth: it is over" in d.status[0].message for d in found))
+    assert all(d.status[0].level != DiagnosticStatus.ERROR for d in found)
+    assert "if the camera was restarted" in heartbeats(graph, node, "too old").message
 
 
 def test_bad_input_is_refused_and_the_node_lives(graph):
