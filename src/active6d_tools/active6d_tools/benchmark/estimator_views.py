@@ -1,4 +1,4 @@
-"""Runs estimators on the same views of stored scenes, and counts how much fusion of several views adds."""
+"""Runs estimators on the same views of stored scenes, and measures what fusion of several views adds."""
 
 import resource
 import sys
@@ -26,11 +26,11 @@ OnProgress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """An estimator that takes part.
+    """An estimator to compare.
 
     Attributes:
         name: of the estimator or of the peer.
-        identity: the name and, for a learned one, which weights.
+        identity: the name, and a hash of the weights of a learned one.
         estimator: ready to run.
     """
 
@@ -55,13 +55,13 @@ class Measurement:
 def enlist(
     model: ObjectModel, estimators: Sequence[str], *, weights: Path | None = None, peers: bool = False
 ) -> list[Contender]:
-    """Make the estimators that take part.
+    """Create the estimators to compare.
 
     Args:
-        model: the object that they look for.
+        model: of the object.
         estimators: names of registered ones.
-        weights: of ``dense``, the shipped ones when None.
-        peers: whether those of :mod:`~active6d_tools.benchmark.peers` take part, too.
+        weights: of ``dense``; the shipped ones if None.
+        peers: whether to add those of :mod:`~active6d_tools.benchmark.peers`.
 
     Raises:
         ValueError: a name is unknown, weights are missing, or the library of a peer is not installed.
@@ -94,19 +94,19 @@ def measure_estimators(
     """Run estimators on the same views of stored scenes, each view rendered once.
 
     Args:
-        object_name: what is in the bins.
+        object_name: of the objects in the bins.
         split: of the stored scenes.
         contenders: as from :func:`enlist`.
-        sample: number of (scene, view) pairs drawn by ``seed``; None takes every view of every scene.
-        moves: views after the first in one random walk a scene, for what fusion finds at the first of ``noises``; 0
-            leaves that out, as it is left out for peers.
-        seed: of the sample, the walks and the sensor's noise.
-        noises: factors on the sensor's noise; 0 switches it off.
-        records: results of single views go to this file, and are taken from it where it has them.
-        on_progress: called with what is being done, and how much of it is done.
+        sample: number of (scene, view) pairs drawn with ``seed``; None takes every view of every scene.
+        moves: number of moves of a random walk in each scene, whose views are fused with the first of ``noises``; 0
+            for no walks. Peers have no walks.
+        seed: of the sample, the walks and the sensor noise.
+        noises: factors on the sensor noise; 0 switches it off.
+        records: file of results of single views; existing results are used, new ones are appended.
+        on_progress: called with a description, the number of steps done and the number of all steps.
 
     Raises:
-        ValueError: the object or the split is not known, or the records are of other measurements.
+        ValueError: an unknown object or split, or records of other measurements.
     """
     if split not in SPLITS:
         raise ValueError(f"unknown split '{split}'; known: {', '.join(SPLITS)}")
@@ -117,23 +117,14 @@ def measure_estimators(
     pairs = _draw_views(rng, len(scenes), sample)
     walks = [[int(view) for view in rng.permutation(len(ViewSphere()))[: moves + 1]] for _ in scenes]
     views = GridViews(model, scenes, seed)
-    tasks = _measure_views(contenders, views, pairs, noises, store, on_progress)
-    results = {
-        (noise, contender.name): EstimatorResult(
-            model.diameter, tuple(store[contender.identity, noise, scene, view] for scene, view in pairs)
-        )
-        for noise in noises
-        for contender in contenders
-    }
-    rows: dict[str, dict[str, Any]] = {f"{noise:g}": {} for noise in noises}
-    for (noise, name), result in results.items():
-        rows[f"{noise:g}"][name] = summarise(model, result, [scene for scene, _ in pairs])
+    results = _measure_views(contenders, views, pairs, noises, store, on_progress)
+    rows = _summarise_all(model, results, [scene for scene, _ in pairs])
+    done = len(pairs) * len(results)
     for contender in contenders:
         if moves and contender.name not in PEERS:
-            on_progress(f"{contender.name}, fused", tasks, tasks)
-            episodes = ([views.capture(scene, view, noises[0]) for view in walk] for scene, walk in enumerate(walks))
-            fused = detection_over_views(contender.estimator, model, episodes).mean(axis=0)
-            rows[f"{noises[0]:g}"][contender.name]["fused"] = fused.tolist()
+            on_progress(f"{contender.name}, fused", done, done)
+            fused = _fuse_walks(contender, views, walks, noises[0])
+            rows[f"{noises[0]:g}"][contender.name]["fused"] = fused
     document = {
         "object": object_name,
         "split": split,
@@ -153,8 +144,8 @@ def _measure_views(
     noises: Sequence[float],
     store: Records,
     on_progress: OnProgress,
-) -> int:
-    """Run every estimator on every view that ``store`` has no result of; the number of results."""
+) -> dict[tuple[float, str], EstimatorResult]:
+    """Results by noise and estimator; estimators run on the views that ``store`` has no result of."""
     verifier = Verifier(views.model)
     tasks = [(*pair, noise, contender) for pair in pairs for noise in noises for contender in contenders]
     for done, (scene, view, noise, contender) in enumerate(tasks):
@@ -164,7 +155,29 @@ def _measure_views(
             labelled = views.capture(scene, view, noise)
             store.add(key, evaluate_view(contender.estimator, verifier, views.model, labelled))
     on_progress("views", len(tasks), len(tasks))
-    return len(tasks)
+    return {
+        (noise, contender.name): EstimatorResult(
+            views.model.diameter, tuple(store[contender.identity, noise, scene, view] for scene, view in pairs)
+        )
+        for noise in noises
+        for contender in contenders
+    }
+
+
+def _summarise_all(
+    model: ObjectModel, results: dict[tuple[float, str], EstimatorResult], scenes: Sequence[int]
+) -> dict[str, dict[str, Any]]:
+    """Summaries by noise and estimator."""
+    rows: dict[str, dict[str, Any]] = {}
+    for (noise, name), result in results.items():
+        rows.setdefault(f"{noise:g}", {})[name] = summarise(model, result, scenes)
+    return rows
+
+
+def _fuse_walks(contender: Contender, views: GridViews, walks: Sequence[Sequence[int]], noise: float) -> list[float]:
+    """Detection rate after each view of a walk, averaged over the walks, one walk for each scene."""
+    episodes = ([views.capture(scene, view, noise) for view in walk] for scene, walk in enumerate(walks))
+    return detection_over_views(contender.estimator, views.model, episodes).mean(axis=0).tolist()
 
 
 def _draw_views(rng: np.random.Generator, scenes: int, sample: int | None) -> list[tuple[int, int]]:

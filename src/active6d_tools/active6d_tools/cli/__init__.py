@@ -1,4 +1,4 @@
-"""The ``active6d`` command: one file a subcommand, every heavy import inside the function that needs it."""
+"""The ``active6d`` command: one file per subcommand. Slow imports are inside the functions that need them."""
 
 import os
 import sys
@@ -29,7 +29,7 @@ from active6d_tools.cli import (
 
 
 class CommandGroup(TyperGroup):
-    """AxisRotationErrors bad input into one clear line on standard error and exit code 2."""
+    """Reports bad input in one line on standard error and exits with code 2."""
 
     def invoke(self, ctx: typer.Context) -> Any:
         """Run the command.
@@ -44,7 +44,7 @@ class CommandGroup(TyperGroup):
             self._refuse(f"{error.format_message()} (see {context.command_path} --help)", error)
         except BrokenPipeError:
             raise
-        # The packages say what is wrong with a name, a file or a parameter by these two, in one line.
+        # The packages raise these two for a wrong name, file or parameter; the message is one line.
         except (ValueError, OSError) as error:
             self._refuse(str(error), error)
 
@@ -78,7 +78,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    help="Look at a heap, find every object's 6D pose, move the camera where it helps most.\n\n"
+    help="Estimate the 6D pose of every object in a bin; move the camera to the view that helps most.\n\n"
     "Example: [bold]active6d episode --object mug --seed 7 --policy lowest-score --bag bags/mug[/bold]",
     epilog="ACTIVE6D_TRACEBACK=1 shows the full traceback of an error.",
 )
@@ -86,7 +86,7 @@ app = typer.Typer(
 
 @app.callback()
 def show_help(ctx: typer.Context) -> None:
-    """Without a command, help is what one wants."""
+    """Show the help if no command is given."""
     if ctx.invoked_subcommand is None:
         typer.echo(ctx.get_help())
 
@@ -112,6 +112,6 @@ app.add_typer(train_estimator.app, name="train")
 
 def main() -> None:
     """Entry point of the ``active6d`` executable."""
-    # ROS stays on this machine unless the user says otherwise: an episode is no business of the neighbours'.
+    # ROS discovery stays on this machine unless the user sets it, so that episodes of other machines do not mix.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     sys.exit(app(prog_name="active6d"))

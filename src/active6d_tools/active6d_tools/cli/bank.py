@@ -5,14 +5,14 @@ from typing import Annotated
 
 import typer
 
-from active6d_tools.cli.options import Banks, Imports, JsonFile, ObjectName, Seed
+from active6d_tools.cli.options import Banks, Imports, JsonFile, ObjectName, Seed, Split
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.terminal import console, progress_bar
 
 
 def bank(
     object_name: ObjectName = "mug",
-    split: Annotated[str, typer.Option(help="Split of the stored scenes: train, val or test.")] = "test",
+    split: Split = "test",
     estimator: Annotated[str, typer.Option(help="Estimator for each view: auto, {estimators}.")] = "auto",
     scenes: Annotated[int | None, typer.Option(min=1, help="Number of stored scenes; by default all.")] = None,
     heaps: Annotated[int, typer.Option(min=0, help="Number of additional simulated piles; for train and val.")] = 0,

@@ -20,12 +20,12 @@ def benchmark() -> None:
 def graph(
     object_name: ObjectName = "mug",
     seed: Seed = 0,
-    views: Annotated[int, typer.Option(min=2, help="Views of one episode.")] = 11,
-    hypotheses: Annotated[int, typer.Option(min=1, help="Hypotheses a view.")] = 20,
-    repeats: Annotated[int, typer.Option(min=1, help="Episodes; a view's time is their median.")] = 5,
+    views: Annotated[int, typer.Option(min=2, help="Number of views in an episode.")] = 11,
+    hypotheses: Annotated[int, typer.Option(min=1, help="Number of hypotheses per view.")] = 20,
+    repeats: Annotated[int, typer.Option(min=1, help="Number of episodes; times are medians over them.")] = 5,
     json_file: JsonFile = None,
 ) -> None:
-    """Compare the node graph with calling the core functions, and time verification and fusion.
+    """Measure the overhead of the node graph over direct calls of the same functions.
 
     Example: [bold]active6d benchmark graph --object mug --json graph.json[/bold]
     """
@@ -45,8 +45,8 @@ def graph(
             repeats=repeats,
             on_progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
         )
-    table = Table(box=None, pad_edge=False, title=f"{object_name}, {views} views, {hypotheses} hypotheses a view")
-    for column in ("", "ms a view", "beyond direct calls"):
+    table = Table(box=None, pad_edge=False, title=f"{object_name}, {views} views, {hypotheses} hypotheses per view")
+    for column in ("", "ms per view", "overhead"):
         table.add_column(column, justify="left" if not column else "right", header_style="dim")
     table.add_row("core functions called directly", f"{result['direct_ms']:.2f}", "")
     table.add_row("through the graph", f"{result['graph_ms']:.2f}", f"{result['overhead_ms']:.2f} ms")

@@ -5,22 +5,22 @@ from typing import Annotated
 
 import typer
 
-from active6d_tools.cli.options import Banks, JsonFile, ObjectName, Seed
+from active6d_tools.cli.options import Banks, JsonFile, ObjectName, Seed, Split
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
 
 def environment(
     object_name: ObjectName = "mug",
-    split: Annotated[str, typer.Option(help="Which bank: train, val or test.")] = "test",
-    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for one a core.")] = 0,
-    environments: Annotated[int, typer.Option(min=1, help="Episodes side by side in each process.")] = 512,
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long to measure.")] = 5.0,
+    split: Split = "test",
+    workers: Annotated[int, typer.Option(min=0, help="Number of processes; 0 for one per core.")] = 0,
+    environments: Annotated[int, typer.Option(min=1, help="Number of parallel episodes in each process.")] = 512,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Duration of the measurement in seconds.")] = 5.0,
     banks: Banks = None,
     seed: Seed = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Count the steps a second that the training environment makes, with the deployed fusion in every one.
+    """Measure the training environment in steps per second; every step runs the deployed fusion.
 
     Example: [bold]active6d benchmark environment --object mug --json environment.json[/bold]
     """
@@ -32,19 +32,23 @@ def environment(
         result = measure_environment(
             bank, workers=workers or None, environments=environments, seconds=seconds, seed=seed
         )
-    console.print(f"{result['steps_per_second']:,.0f} steps a second in {result['workers']} processes", highlight=False)
+    console.print(
+        f"{result['steps_per_second']:,.0f} steps per second in {result['workers']} processes", highlight=False
+    )
     write_json(json_file, {"object": object_name, "split": split, "seed": seed, **result})
 
 
 def pipeline(
     object_name: ObjectName = "mug",
     policy: Annotated[str, typer.Option(help="Policy that chooses the views: {policies}.")] = "view-attention",
-    repeats: Annotated[int, typer.Option(min=1, help="Of every measurement.")] = 50,
-    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw costs over hypotheses into this PNG.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Number of repetitions of every measurement.")] = 50,
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw times over the number of hypotheses to this PNG file.")
+    ] = None,
     seed: Seed = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Time verification, fusion and policy: 15 objects after 6 views, and 10 to 1000 accumulated hypotheses.
+    """Measure the time of verification, fusion and policy for 10 to 1000 accumulated hypotheses.
 
     Example: [bold]active6d benchmark pipeline --object mug --json pipeline.json --png pipeline.png[/bold]
     """

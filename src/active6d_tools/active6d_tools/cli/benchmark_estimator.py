@@ -2,51 +2,54 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
-from active6d_tools.cli.options import JsonFile, ObjectName, Seed
+from active6d_tools.cli.options import JsonFile, ObjectName, Seed, Split
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.terminal import console, messages, progress_bar
+
+if TYPE_CHECKING:
+    from active6d_core.object_model import ObjectModel
+    from active6d_tools.benchmark.estimator_views import Measurement
 
 
 def estimator(
     object_name: ObjectName = "mug",
     names: Annotated[
-        list[str] | None, typer.Option("--estimator", help="Estimator; repeatable. All that know it by default.")
+        list[str] | None,
+        typer.Option("--estimator", help="Name of an estimator; repeatable. By default all that support the object."),
     ] = None,
-    peers: Annotated[
-        bool, typer.Option("--peers", help="Also OpenCV's PPF and FPFH with RANSAC; use --sample.")
-    ] = False,
-    split: Annotated[str, typer.Option(help="Which stored scenes.")] = "test",
-    sample: Annotated[int | None, typer.Option(min=1, help="That many views, drawn by --seed; all by default.")] = None,
+    peers: Annotated[bool, typer.Option("--peers", help="Also measure PPF and FPFH with RANSAC (slow).")] = False,
+    split: Split = "test",
+    sample: Annotated[int | None, typer.Option(min=1, help="Number of views, sampled with --seed.")] = None,
     noise: Annotated[
-        list[float] | None, typer.Option(min=0.0, help="Factor on the sensor's noise; repeatable. 1 by default.")
+        list[float] | None,
+        typer.Option(min=0.0, help="Factor on the noise of the simulated sensor; repeatable. By default 1."),
     ] = None,
-    moves: Annotated[int, typer.Option(min=0, help="Also fuse this many moves a scene.")] = 0,
+    moves: Annotated[int, typer.Option(min=0, help="Also fuse the views of this many moves in each scene.")] = 0,
     weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Of the dense estimator, instead of the shipped ones.")
+        Path | None, typer.Option(metavar="FILE", help="Weights of the dense estimator instead of the shipped ones.")
     ] = None,
     records: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Keep every view's result here, and go on from what it holds.")
+        Path | None, typer.Option(metavar="FILE", help="File for the results of all views; a run continues from it.")
     ] = None,
-    plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw the study of the scores as PNG.")] = None,
+    plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for PNG plots of the scores.")] = None,
     seed: Seed = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Count what estimators find in single views, how right and how fast they are, and what their scores tell.
+    """Measure detection rate, precision, score quality and time of estimators on single views.
 
     Example: [bold]active6d benchmark estimator --object mug --sample 50 --plots plots --json mug.json[/bold]
     """
     from active6d_core.object_model import load_object
     from active6d_perception.estimators.registry import list_estimators, weights_path
-    from active6d_tools.benchmark.estimator_plots import draw_ambiguity, draw_verification
     from active6d_tools.benchmark.estimator_views import enlist, measure_estimators
 
     model = load_object(object_name)
-    # The learned one takes part for objects that it has learned.
+    # The dense estimator needs weights of the object.
     able = [name for name in list_estimators() if name != "dense" or (weights or weights_path(object_name)).is_file()]
     with progress_bar() as progress:
         task = progress.add_task("loading", total=None)
@@ -62,28 +65,40 @@ def estimator(
             records=records,
             on_progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
         )
-    part = " or ".join(model.features)
+    _print(measured, f"{object_name}, {split}", " or ".join(model.features))
+    write_json(json_file, measured.document)
+    if plots is not None:
+        _draw(plots, model, f"{object_name}, {split}", measured)
+
+
+def _print(measured: "Measurement", title: str, part: str) -> None:
     for factor, rows in measured.document["noise"].items():
-        title = f"{object_name}, {split}, {measured.document['views']} views, noise x{factor}"
-        for table in (_rates(title, rows, part), _details(rows, part)):
+        for table in (
+            _rates(f"{title}, {measured.document['views']} views, noise x{factor}", rows, part),
+            _details(rows, part),
+        ):
             console.print(table)
             console.print()
-    console.print(f"peak memory of the process {measured.document['peak_memory_mib']:.0f} MiB", highlight=False)
-    write_json(json_file, measured.document)
-    for (factor, name), result in measured.results.items() if plots else ():
-        ending = f"{object_name}_{name}_noise{factor:g}.png"
-        title = f"{object_name}, {split}, {name}, noise x{factor:g}, {len(result.views)} views"
-        draw_verification(plots / f"verification_{ending}", title, result)
+    console.print(f"peak memory of this process: {measured.document['peak_memory_mib']:.0f} MiB", highlight=False)
+
+
+def _draw(folder: Path, model: "ObjectModel", title: str, measured: "Measurement") -> None:
+    from active6d_tools.benchmark.estimator_plots import draw_ambiguity, draw_verification
+
+    for (factor, name), result in measured.results.items():
+        ending = f"{model.name}_{name}_noise{factor:g}.png"
+        own = f"{title}, {name}, noise x{factor:g}, {len(result.views)} views"
+        draw_verification(folder / f"verification_{ending}", own, result)
         if model.features:
-            draw_ambiguity(plots / f"ambiguity_{ending}", title, model, result)
-        messages.print(f"wrote {plots}/*_{ending}", highlight=False)
+            draw_ambiguity(folder / f"ambiguity_{ending}", own, model, result)
+        messages.print(f"wrote {folder}/*_{ending}", highlight=False)
 
 
 def _rates(title: str, rows: dict[str, dict[str, Any]], part: str) -> Table:
-    """Shares found by visible fraction with their 95 % intervals, and precision; ``part`` is what tells the turn."""
+    """Detection rates by visible fraction and precision, with 95 % intervals; ``part`` breaks the symmetry."""
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
     table.add_column("detection at 10 %", header_style="dim", no_wrap=True)
-    for column in ("e_ADD ≥half", "≥tenth", "ADD-S ≥half", "≥tenth", "precision"):
+    for column in ("ADD ≥half", "≥tenth", "ADD-S ≥half", "≥tenth", "precision"):
         table.add_column(column, justify="right", header_style="dim")
     for name, row in rows.items():
         cells = [_interval(row[kind][least]) for kind in ("add", "adds") for least in ("0.5", "0.1")]
@@ -96,7 +111,7 @@ def _rates(title: str, rows: dict[str, dict[str, Any]], part: str) -> Table:
 
 
 def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
-    """BOP's recalls and precisions, what the scores tell, times; a column an estimator."""
+    """BOP's recalls and precisions, quality of the scores, times; one column per estimator."""
     table = Table(box=None, pad_edge=False)
     table.add_column("", no_wrap=True)
     for name in rows:
@@ -114,12 +129,15 @@ def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
     _add_scores(add)
     if all("ambiguity" in row for row in rows.values()):
         for where in ("seen", "hidden"):
-            add(f"right turn, {part} {where}", lambda row, where=where: _number(row["ambiguity"][where]["right_turn"]))
-        add("right from wrong turn, area under the curve", lambda row: _number(row["ambiguity"]["auc"]))
+            add(
+                f"axis rotation right, {part} {where}",
+                lambda row, where=where: _number(row["ambiguity"][where]["right_turn"]),
+            )
+        add("certainty of the axis rotation, area under the curve", lambda row: _number(row["ambiguity"]["auc"]))
     _add_times(add, rows)
     if any("fused" in row for row in rows.values()):
         add(
-            "all objects, e_ADD: one view, fused",
+            "all objects, ADD: one view, fused",
             lambda row: f"{row['fused'][0]:.2f}, {row['fused'][-1]:.2f}" if "fused" in row else "-",
         )
     return table
@@ -127,7 +145,7 @@ def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
 
 def _add_scores(add: Callable) -> None:
     for kind, label in (("equation_1", "verification"), ("own_score", "own score")):
-        for measure, text in (("auc_adds", "area under the curve"), ("spearman_add", "rank correlation, e_ADD")):
+        for measure, text in (("auc_adds", "area under the curve"), ("spearman_add", "rank correlation, ADD")):
             add(f"{label}, {text}", lambda row, kind=kind, measure=measure: _number(row["verification"][kind][measure]))
 
 

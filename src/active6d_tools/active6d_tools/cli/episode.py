@@ -22,28 +22,29 @@ if TYPE_CHECKING:
     from active6d_bringup.graph.episode import EpisodeResult, EpisodeSettings, EpisodeStep
     from active6d_core.metrics import SceneScore
 
+_ESTIMATOR = "Estimator of the poses in each view: auto, {estimators}; by default that of the params file."
+
 
 def episode(
     object_name: ObjectName = "mug",
     seed: Seed = 0,
     policy: Annotated[str, typer.Option(help="Policy that chooses the views: auto, {policies}.")] = "auto",
-    steps: Annotated[int, typer.Option(min=0, help="Budget of moves T; T moves are T + 1 images.")] = 5,
-    metres: Annotated[float | None, typer.Option(min=0.0, help="Budget of metres along the hemisphere.")] = None,
-    estimator: Annotated[
-        str | None, typer.Option(help="Estimator: auto, {estimators}; by default that of the params file.")
-    ] = None,
+    steps: Annotated[int, typer.Option(min=0, help="Budget of moves T; T moves give T + 1 views.")] = 5,
+    metres: Annotated[float | None, typer.Option(min=0.0, help="Travel budget in metres along the hemisphere.")] = None,
+    estimator: Annotated[str | None, typer.Option(help=_ESTIMATOR)] = None,
     scene: Annotated[
-        str | None, typer.Option(metavar="NAME", help="A stored scene such as mug/test/3 instead of a heap by seed.")
+        str | None,
+        typer.Option(metavar="NAME", help="Stored scene, such as mug/test/3, instead of a pile simulated with --seed."),
     ] = None,
-    bag: Annotated[Path | None, typer.Option(metavar="DIR", help="Record every topic into this new folder.")] = None,
+    bag: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Record every topic to a bag in this new folder.")
+    ] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the HTML report of the bag; needs --bag.")
+        Path | None, typer.Option(metavar="FILE", help="Write an HTML report of the bag; needs --bag.")
     ] = None,
     figure: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Draw before and after, attention against scores, and the path; needs --bag."
-        ),
+        typer.Option(metavar="FILE", help="Draw a figure of the episode as PNG; needs --bag."),
     ] = None,
     processes: Processes = False,
     params_file: ParamsFile = None,
@@ -51,13 +52,15 @@ def episode(
     imports: Imports = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Let the graph look at a heap, think and move, once: the same seed gives the same episode.
+    """Run one episode: the node graph estimates, fuses and moves the camera until the budget is spent.
+
+    The same seed gives the same episode.
 
     Example: [bold]active6d episode --object mug --seed 7 --policy lowest-score --steps 5 --bag bags/mug[/bold]
     """
     if bag is None and (report is not None or figure is not None):
         option = "--report" if report is not None else "--figure"
-        raise ValueError(f"{option} needs --bag, because it is made from what was recorded")
+        raise ValueError(f"{option} needs --bag, because it is made from the bag")
     with messages.status("starting"):
         from active6d_bringup.graph.episode import EpisodeSettings
 
@@ -78,16 +81,20 @@ def episode(
     result = _run(settings)
     summary = _summary(result)
     _print_summary(result, summary)
-    if report is not None or figure is not None:
-        from active6d_bringup.bags.reader import read_episode
-        from active6d_tools.report.analysis import analyse
-
-        write_reports(analyse(read_episode(bag)), report, figure=figure)
+    if bag is not None and (report is not None or figure is not None):
+        _write_reports(bag, report, figure)
     write_json(json_file, summary)
 
 
+def _write_reports(bag: Path, report: Path | None, figure: Path | None) -> None:
+    from active6d_bringup.bags.reader import read_episode
+    from active6d_tools.report.analysis import analyse
+
+    write_reports(analyse(read_episode(bag)), report, figure=figure)
+
+
 def _check_names(settings: "EpisodeSettings") -> None:
-    """Refuse wrong names before any node starts: a node's process could only say so in its log."""
+    """Refuse wrong names before any node starts; a node in its own process could report them only in its log."""
     from active6d_agent.policies.registry import list_policies
     from active6d_core.object_model import load_object
     from active6d_core.registry import AUTOMATIC
@@ -103,7 +110,7 @@ def _check_names(settings: "EpisodeSettings") -> None:
 
 
 def _run(settings: "EpisodeSettings") -> "EpisodeResult":
-    """Run with a line a view and a bar; an episode that fails is one line and exit code 1."""
+    """Run with one line per view and a progress bar; a failed episode gives one line and exit code 1."""
     from rich.markup import escape
 
     from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, run_episode
@@ -152,7 +159,7 @@ def _score(step: "EpisodeStep", object_name: str) -> "SceneScore | None":
 
 
 def _summary(result: "EpisodeResult") -> dict[str, Any]:
-    """The numbers for JSON, all poses included, so that two episodes can be compared."""
+    """The numbers for JSON, with all poses, so that two episodes can be compared."""
     last = _score(result.steps[-1], result.settings.object)
     return {
         "object": result.settings.object,
@@ -196,7 +203,7 @@ def _print_summary(result: "EpisodeResult", summary: dict[str, Any]) -> None:
         table.add_row("objects", str(len(result.objects)))
     else:
         found = f"{summary['detection_rate'] * summary['objects_true']:.0f} of {summary['objects_true']}"
-        table.add_row("found", f"{found} ({summary['detection_rate']:.0%}), mean e_ADD {summary['e_add_mm']:.1f} mm")
+        table.add_row("found", f"{found} ({summary['detection_rate']:.0%}), mean ADD {summary['e_add_mm']:.1f} mm")
     for event in result.events:
         if not event.startswith("starting "):
             table.add_row("event", escape(event))

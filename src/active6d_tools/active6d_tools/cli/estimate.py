@@ -1,5 +1,6 @@
 """``active6d estimate``."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -7,13 +8,12 @@ import typer
 
 from active6d_core.files import write_file
 from active6d_tools.cli.options import Imports, JsonFile, ObjectName
-from active6d_tools.cli.output import write_json
+from active6d_tools.cli.output import write_json, write_png
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
-
     from active6d_core.camera import View
+    from active6d_tools.image_estimation import ImageResult, Overlay
 
 _BOX = "Use only depth inside a box: X_MIN Y_MIN Z_MIN X_MAX Y_MAX Z_MAX in metres, in the camera's optical frame."
 
@@ -22,24 +22,29 @@ def estimate(
     folder: Annotated[Path | None, typer.Argument(metavar="[FOLDER]", help="A scene folder in BOP format.")] = None,
     object_name: ObjectName = "mug",
     rgb: Annotated[Path | None, typer.Option(metavar="FILE", help="One colour image instead of a folder.")] = None,
-    depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Its depth image: 16 bits, or .npy.")] = None,
+    depth: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Depth image of --rgb: 16-bit image or .npy array.")
+    ] = None,
     intrinsics: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Its intrinsics: JSON with K or cam_K, 9 numbers.")
+        Path | None, typer.Option(metavar="FILE", help="Intrinsics of --rgb: JSON file with K or cam_K, 9 numbers.")
     ] = None,
     depth_scale: Annotated[
-        float | None, typer.Option(min=0.0, help="Metres per unit of --depth; 0.001 for integers, else 1.")
+        float | None,
+        typer.Option(min=0.0, help="Metres per unit of --depth; by default 0.001 for integers, 1 for floats."),
     ] = None,
     estimator: Annotated[str, typer.Option(help="Estimator that finds the poses: auto, {estimators}.")] = "auto",
     depth_range: Annotated[
         tuple[float, float] | None,
-        typer.Option("--range", metavar="NEAR FAR", help="Use only these distances, metres."),
+        typer.Option("--range", metavar="NEAR FAR", help="Use only depth in this range, in metres."),
     ] = None,
     region: Annotated[tuple[float, float, float, float, float, float] | None, typer.Option(help=_BOX)] = None,
     region_in_world: Annotated[
-        bool, typer.Option("--region-in-world", help="The box is in the world; the scene needs camera poses.")
+        bool, typer.Option("--region-in-world", help="The box is in the world frame; the scene needs camera poses.")
     ] = False,
-    object_id: Annotated[int, typer.Option(min=1, help="BOP's number of the object, for the CSV file.")] = 1,
-    min_score: Annotated[float, typer.Option(min=0.0, max=1.0, help="Draw only hypotheses of at least it.")] = 0.5,
+    object_id: Annotated[int, typer.Option(min=1, help="BOP object id for the CSV file.")] = 1,
+    min_score: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Draw only hypotheses with at least this score.")
+    ] = 0.5,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")] = Path("estimates"),
     imports: Imports = None,
     json_file: JsonFile = None,
@@ -62,25 +67,34 @@ def estimate(
     box = (np.array(region[:3]), np.array(region[3:])) if region is not None else None
     with messages.status(f"loading the estimator of {object_name}"):
         finder = Active6D(object_name, estimator)
-    overlay, results = Overlay(finder.model), []
+    found = estimate_images(
+        finder, scene_id, images, depth_range=depth_range, region=box, region_in_world=region_in_world
+    )
+    results = _draw_each(found, len(images), Overlay(finder.model), out / "overlays", min_score)
+    _print(results, min_score)
+    write_file(out / "results.csv", bop_csv(results, finder.model, object_id))
+    messages.print(f"wrote {out / 'results.csv'} and {out / 'overlays'}", highlight=False, markup=False)
+    write_json(json_file, {"object": object_name, "estimator": estimator, "images": describe(results, finder.model)})
+
+
+def _draw_each(
+    found: Iterator["ImageResult"], total: int, overlay: "Overlay", folder: Path, min_score: float
+) -> list["ImageResult"]:
+    """The results; each is drawn as soon as it is there."""
+    results = []
     with progress_bar() as bar:
-        task = bar.add_task("estimating", total=len(images))
-        found = estimate_images(
-            finder, scene_id, images, depth_range=depth_range, region=box, region_in_world=region_in_world
-        )
-        for result in found:
+        for result in bar.track(found, total=total, description="estimating"):
             results.append(result)
             shown = result.hypotheses.take(result.hypotheses.score >= min_score)
-            path = out / "overlays" / f"{result.image_id:06d}.png"
-            write_file(path, _png(overlay.draw(result.view, shown)))
-            bar.update(task, advance=1)
+            write_png(folder / f"{result.image_id:06d}.png", overlay.draw(result.view, shown))
+    return results
+
+
+def _print(results: list["ImageResult"], min_score: float) -> None:
     for result in results:
         sure = int((result.hypotheses.score >= min_score).sum())
         text = f"image {result.image_id:6}  hypotheses {len(result.hypotheses):3}  score >= {min_score:g}: {sure:3}"
         console.print(f"{text}  {result.seconds:.2f} s", highlight=False)
-    write_file(out / "results.csv", bop_csv(results, finder.model, object_id))
-    messages.print(f"wrote {out / 'results.csv'} and {out / 'overlays'}", highlight=False, markup=False)
-    write_json(json_file, {"object": object_name, "estimator": estimator, "images": describe(results, finder.model)})
 
 
 def _read(
@@ -91,7 +105,7 @@ def _read(
     depth_scale: float | None,
     needs_poses: bool,
 ) -> tuple[int, list[tuple[int, "View"]]]:
-    """BOP's number of the scene, and numbered views."""
+    """BOP scene id, and views with their BOP image ids."""
     from active6d_tools.image_estimation import read_image, read_scene
 
     single = (rgb, depth, intrinsics)
@@ -102,11 +116,3 @@ def _read(
     if rgb is None or depth is None or intrinsics is None:
         raise ValueError("give a scene folder in BOP format, or all of --rgb, --depth and --intrinsics")
     return 0, [(0, read_image(rgb, depth, intrinsics, depth_scale))]
-
-
-def _png(picture: "Image") -> bytes:
-    import io
-
-    buffer = io.BytesIO()
-    picture.save(buffer, "PNG")
-    return buffer.getvalue()

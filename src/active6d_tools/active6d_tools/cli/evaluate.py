@@ -1,4 +1,4 @@
-"""``active6d evaluate``: the paper's Table 1 on a scene bank."""
+"""``active6d evaluate``: policies on a scene bank, as in the paper's Table 1."""
 
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +12,7 @@ from active6d_tools.cli.options import (
     PolicyParameters,
     Sample,
     Seed,
+    Split,
     parse_overrides,
     usable_policies,
 )
@@ -21,7 +22,7 @@ from active6d_tools.cli.terminal import console, messages, progress_bar
 if TYPE_CHECKING:
     from rich.table import Table
 
-#: What the others are compared with in a table of its own.
+#: A second table compares this policy with the others.
 _DEFAULT = "view-attention"
 Policies = Annotated[
     str, typer.Option(help="Names separated by commas, or all: {policies}; and the bounds oracle and all-views.")
@@ -31,8 +32,8 @@ Policies = Annotated[
 def evaluate(
     object_name: ObjectName = "mug",
     policies: Policies = "all",
-    steps: Annotated[int, typer.Option(min=1, help="Budget of moves T; T moves are T + 1 views.")] = 5,
-    split: Annotated[str, typer.Option(help="Which bank: train, val or test.")] = "test",
+    steps: Annotated[int, typer.Option(min=1, help="Budget of moves T; T moves give T + 1 views.")] = 5,
+    split: Split = "test",
     sample: Sample = None,
     override: PolicyParameters = None,
     imports: Imports = None,
@@ -40,7 +41,7 @@ def evaluate(
     seed: Seed = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Run every policy from the same scenes and starting views: e_ADD, detection rate and metres, with intervals.
+    """Evaluate policies from the same scenes and start views: detection rate, ADD and distance, with 95 % intervals.
 
     Example: [bold]active6d evaluate --object mug --policies all --steps 5 --json mug.json[/bold]
     """
@@ -82,7 +83,7 @@ def _table(summary: dict[str, Any]) -> "Table":
     title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
     table = Table(box=None, pad_edge=False, title=title)
     table.add_column("policy", header_style="dim", no_wrap=True, min_width=max(map(len, summary["policies"])))
-    for column in ("d, m", "e_ADD, mm", "", "detected", "", "gap closed"):
+    for column in ("d, m", "ADD, mm", "", "detected", "", "gap closed"):
         table.add_column(column, justify="right", header_style="dim")
     for name, row in summary["policies"].items():
         error, rate, gap = row["e_add_mm_ci95_scenes"], row["detection_rate_ci95_scenes"], row["gap_closed"]
@@ -101,10 +102,10 @@ def _table(summary: dict[str, Any]) -> "Table":
 def _differences(summary: dict[str, Any]) -> "Table":
     from rich.table import Table
 
-    table = Table(box=None, pad_edge=False, title=f"{_DEFAULT} against the others, by the same starts")
+    table = Table(box=None, pad_edge=False, title=f"{_DEFAULT} minus the others, from the same starts")
     against = summary["policies"][_DEFAULT]["against"]
     table.add_column("against", header_style="dim", no_wrap=True, min_width=max(map(len, against)))
-    for column in ("d, m", "e_ADD, mm", "", "detected", ""):
+    for column in ("d, m", "ADD, mm", "", "detected", ""):
         table.add_column(column, justify="right", header_style="dim")
     for name, measured in against.items():
         cells = [f"{measured['distance_m']['mean']:+.2f}"]

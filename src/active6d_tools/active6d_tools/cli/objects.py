@@ -8,10 +8,12 @@ import typer
 
 from active6d_core.files import write_file
 from active6d_tools.cli.options import JsonFile
-from active6d_tools.cli.output import write_json
+from active6d_tools.cli.output import write_json, write_png
 from active6d_tools.cli.terminal import console, messages
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from active6d_core.object_model import ObjectModel
 
 app = typer.Typer(help="Object models: list, show, add.", rich_markup_mode="rich")
@@ -19,7 +21,7 @@ app = typer.Typer(help="Object models: list, show, add.", rich_markup_mode="rich
 
 @app.command("list")
 def list_models(json_file: JsonFile = None) -> None:
-    """List every object that can fill a bin.
+    """List all objects.
 
     Example: [bold]active6d object list[/bold]
     """
@@ -49,10 +51,12 @@ def list_models(json_file: JsonFile = None) -> None:
 @app.command()
 def show(
     name: Annotated[str, typer.Argument(help="Name of the object.")],
-    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Render the object from four sides.")] = None,
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Render the object from four sides to this PNG file.")
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Say what is known of an object, and render it.
+    """Print the properties of an object and render it.
 
     Example: [bold]active6d object show mug --png mug.png[/bold]
     """
@@ -65,21 +69,24 @@ def show(
         console.print(f" {value}", markup=False, highlight=False)
     if png is not None:
         with messages.status("rendering"):
-            write_file(png, _render(model))
+            write_png(png, _render(model))
         messages.print(f"wrote {png}", highlight=False, markup=False)
     write_json(json_file, description)
 
 
 @app.command()
 def add(
-    mesh: Annotated[Path, typer.Argument(help="Triangle mesh: ply, stl, obj, off or glb; normals outwards.")],
+    mesh: Annotated[Path, typer.Argument(help="Triangle mesh (ply, stl, obj, off or glb) with outward normals.")],
     name: Annotated[str, typer.Option(help="Name of the new object.")],
-    scale: Annotated[float, typer.Option(help="The mesh's unit in metres: 0.001 for millimetres.")] = 1.0,
+    scale: Annotated[float, typer.Option(help="Unit of the mesh in metres, such as 0.001 for millimetres.")] = 1.0,
     axis: Annotated[
-        tuple[float, float, float] | None, typer.Option(help="Axis of a continuous symmetry, in the mesh's frame.")
+        tuple[float, float, float] | None, typer.Option(help="Axis of a continuous symmetry in the mesh frame.")
     ] = None,
-    instances: Annotated[tuple[int, int], typer.Option(help="Fewest and most instances in a scene.")] = (8, 14),
-    color: Annotated[tuple[float, float, float], typer.Option(help="Red, green, blue, from 0 to 1.")] = (
+    instances: Annotated[tuple[int, int], typer.Option(help="Minimum and maximum number of instances in a scene.")] = (
+        8,
+        14,
+    ),
+    color: Annotated[tuple[float, float, float], typer.Option(help="Red, green and blue, each from 0 to 1.")] = (
         0.6,
         0.6,
         0.62,
@@ -88,7 +95,7 @@ def add(
         "objects"
     ),
 ) -> None:
-    """Add an object: copy its mesh and write its description beside it.
+    """Add an object: copy its mesh and write its description file.
 
     Example: [bold]active6d object add bracket.stl --name bracket --scale 0.001 --into objects[/bold]
     """
@@ -141,12 +148,9 @@ def _describe(model: "ObjectModel") -> dict:
     }
 
 
-def _render(model: "ObjectModel") -> bytes:
-    """PNG of the object on a plate from four sides, 30 degrees above the horizon."""
-    import io
-
+def _render(model: "ObjectModel") -> "np.ndarray":
+    """Picture of the object on a plate from four sides, 30 degrees above the horizon."""
     import numpy as np
-    from PIL import Image
 
     from active6d_core.camera import PinholeCamera
     from active6d_core.se3 import look_at, make_transform
@@ -164,6 +168,4 @@ def _render(model: "ObjectModel") -> bytes:
         toward = np.array([np.cos(azimuth), np.sin(azimuth), 0.58])
         eye = target + 3.0 * model.diameter * toward / np.linalg.norm(toward)
         pictures.append(renderer.render(look_at(eye, target), camera).color)
-    buffer = io.BytesIO()
-    Image.fromarray(np.hstack(pictures)).save(buffer, "PNG")
-    return buffer.getvalue()
+    return np.hstack(pictures)

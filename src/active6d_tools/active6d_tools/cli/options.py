@@ -24,6 +24,7 @@ PolicyParameters = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="POLICY.NAME=VALUE", help="Set a parameter of a policy; repeatable."),
 ]
+Split = Annotated[str, typer.Option(help="Split of the scenes: train, val or test.")]
 Banks = Annotated[
     Path | None,
     typer.Option("--banks", metavar="DIR", help="Folder of the banks; by default active6d/banks in the cache folder."),

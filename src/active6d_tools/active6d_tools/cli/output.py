@@ -1,4 +1,4 @@
-"""Files that several subcommands write: JSON with the versions of what made it, weights, reports."""
+"""Files that several subcommands write: JSON results, pictures, weights, reports."""
 
 import json
 import platform
@@ -6,17 +6,20 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from active6d_core.files import write_file
+from active6d_core.files import atomic_file, write_file
 from active6d_tools.cli.terminal import messages
 
 if TYPE_CHECKING:
+    import numpy as np
+    from PIL import Image
+
     from active6d_tools.report.analysis import EpisodeAnalysis
 
 _VERSIONS = ("numpy", "scipy", "open3d", "pybullet", "torch", "rclpy")
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
-    """Write a result with the versions of what made it; nothing happens without a path.
+    """Write a result with the versions of Python and libraries; does nothing without a path.
 
     Raises:
         OSError: the file cannot be written.
@@ -28,8 +31,21 @@ def write_json(path: Path | None, result: dict[str, Any]) -> None:
     messages.print(f"wrote {path}", highlight=False)
 
 
+def write_png(path: Path, picture: "np.ndarray | Image.Image") -> None:
+    """Write a picture: (H, W, 3) uint8 RGB, or Pillow's own.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    from PIL import Image
+
+    with atomic_file(path) as unfinished:
+        image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
+        image.save(unfinished, "PNG")
+
+
 def export_weights(best: Path, folder: Path, name: str) -> None:
-    """Copy weights and the JSON beside them to ``folder`` as ``name``.
+    """Copy weights and their JSON configuration to ``folder`` as ``name``.
 
     Raises:
         OSError: a file cannot be read or written.
@@ -52,7 +68,7 @@ def _installed_versions() -> dict[str, str]:
 def write_reports(
     analysis: "EpisodeAnalysis", html: Path | None = None, png: Path | None = None, figure: Path | None = None
 ) -> None:
-    """Write what has a path: the HTML page, the picture of all views, the figure of before, after and attention.
+    """Write each output that has a path: the HTML page, the picture of all views, the figure of the episode.
 
     Raises:
         OSError: a file cannot be written.

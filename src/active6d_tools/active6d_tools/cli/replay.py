@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 def replay(
     folder: BagFolder,
-    rate: Annotated[float, typer.Option(min=1e-3, help="Speed against the recording's.")] = 1.0,
+    rate: Annotated[float, typer.Option(min=1e-3, help="Speed relative to the recording.")] = 1.0,
     as_fast: Annotated[
-        bool, typer.Option("--as-fast", help="Send a view as soon as the objects of the last one are there.")
+        bool, typer.Option("--as-fast", help="Send each view as soon as the previous one is processed.")
     ] = False,
     compare: Annotated[
-        bool, typer.Option("--compare", help="Exit with 1 unless hypotheses and objects equal the recorded ones.")
+        bool, typer.Option("--compare", help="Exit with code 1 unless hypotheses and objects equal the recorded ones.")
     ] = False,
     object_name: BagObject = None,
     estimator: Annotated[
-        str | None, typer.Option(help="Another estimator than the recorded one: auto, {estimators}.")
+        str | None, typer.Option(help="Estimator to use instead of the recorded one: auto, {estimators}.")
     ] = None,
     processes: Processes = False,
     params_file: ParamsFile = None,
@@ -40,7 +40,7 @@ def replay(
     imports: Imports = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Send a bag's camera through live perception.
+    """Send the camera images of a bag through the perception nodes again.
 
     Example: [bold]active6d replay bags/mug --as-fast --compare[/bold]
     """

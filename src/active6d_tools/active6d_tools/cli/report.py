@@ -16,19 +16,18 @@ if TYPE_CHECKING:
 def report(
     folder: BagFolder,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="The HTML file; DIR/report.html by default.")
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="HTML file; by default DIR/report.html.")
     ] = None,
-    png: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw the views and how the score rose, as one picture.")
-    ] = None,
+    png: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw all views and the scores as one PNG.")] = None,
     figure: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw before and after, attention against scores, and the path.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Draw a figure of the episode as PNG: before, after, attention, path."),
     ] = None,
     object_name: BagObject = None,
-    episode: Annotated[int, typer.Option(min=0, help="Which episode of a bag with several, from 0.")] = 0,
+    episode: Annotated[int, typer.Option(min=0, help="Number of the episode in a bag with several, from 0.")] = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Make one self-contained HTML file of a recorded episode, and say the same in short here.
+    """Write a self-contained HTML report of a recorded episode and print a summary.
 
     Example: [bold]active6d report bags/mug -o mug.html --figure mug.png[/bold]
     """
@@ -38,7 +37,7 @@ def report(
     with messages.status("reading the bag"):
         records = read_episodes(folder)
         if episode >= len(records):
-            raise ValueError(f"--episode {episode}: {folder} holds {len(records)}, counted from 0")
+            raise ValueError(f"--episode {episode}: {folder} has {len(records)}, counted from 0")
         analysis = analyse(records[episode], object_name)
     write_reports(analysis, output or folder / "report.html", png, figure)
     print_summary(analysis)
@@ -46,7 +45,7 @@ def report(
 
 
 def print_summary(analysis: "EpisodeAnalysis") -> None:
-    """The report in short: a line per view, then the totals."""
+    """Print one line per view, then the totals."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -55,7 +54,7 @@ def print_summary(analysis: "EpisodeAnalysis") -> None:
     title = "  ".join(part for part in (record.scene or analysis.model.name, record.policy) if part)
     table = Table(box=None, pad_edge=False, title=escape(title), title_justify="left", title_style="bold")
     columns = ["view", "camera", "moved", "hypotheses", "objects", "attends to"]
-    for column in [*columns, *(["found", "e_ADD"] if known else [])]:
+    for column in [*columns, *(["found", "ADD"] if known else [])]:
         table.add_column(column, justify="right", header_style="dim", no_wrap=True)
     for step in analysis.steps:
         truth = step.truth
@@ -72,7 +71,7 @@ def print_summary(analysis: "EpisodeAnalysis") -> None:
         )
     console.print(table)
     found = f"found {last.truth.detected.sum()} of {len(last.truth.detected)} objects, " if known else ""
-    error = f"mean e_ADD {last.truth.mean_e_add_mm:.1f} mm, " if known else f"{len(last.rows)} objects, "
+    error = f"mean ADD {last.truth.mean_e_add_mm:.1f} mm, " if known else f"{len(last.rows)} objects, "
     console.print(f"{found}{error}{analysis.distance_m:.2f} m in {len(analysis.steps) - 1} moves", highlight=False)
     times = ", ".join(f"{time.node} {time.median_ms:.1f} ms" for time in analysis.node_times)
     if times:

@@ -5,9 +5,8 @@ from typing import Annotated
 
 import typer
 
-from active6d_core.files import write_file
-from active6d_tools.cli.options import JsonFile, ObjectName, Seed
-from active6d_tools.cli.output import write_json
+from active6d_tools.cli.options import JsonFile, ObjectName, Seed, Split
+from active6d_tools.cli.output import write_json, write_png
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
 app = typer.Typer(help="Stored scenes: generate, report, show.", rich_markup_mode="rich")
@@ -17,10 +16,12 @@ app = typer.Typer(help="Stored scenes: generate, report, show.", rich_markup_mod
 def generate(
     object_name: ObjectName = "mug",
     into: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the stored scenes.")] = Path("scenes"),
-    split: Annotated[list[str] | None, typer.Option(help="train, val or test; repeatable. All by default.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one a core by default.")] = None,
+    split: Annotated[
+        list[str] | None, typer.Option(help="Split: train, val or test; repeatable. By default all.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per core.")] = None,
 ) -> None:
-    """Drop the heaps of every split and store those that are not there yet; their seeds are fixed.
+    """Simulate the piles of every split and store them; stored ones are kept. Their seeds are fixed.
 
     Example: [bold]active6d scenes generate --object mug --into scenes[/bold]
     """
@@ -33,7 +34,7 @@ def generate(
     with progress_bar() as progress:
         total = sum(SPLITS.get(name, 0) for name in splits)
         there = sum(1 for name in splits for _ in (into / object_name).glob(f"{name}_??.npz"))
-        task = progress.add_task(f"dropping {object_name}", total=total, completed=there)
+        task = progress.add_task(f"simulating {object_name}", total=total, completed=there)
         for path in store_scenes(object_name, into, splits=splits, workers=workers):
             progress.update(task, advance=1, description=path.stem)
     console.print(f"{total} scenes in {into / object_name}", highlight=False, markup=False)
@@ -44,12 +45,12 @@ def generate(
 @app.command()
 def report(
     object_name: ObjectName = "mug",
-    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
-    moves: Annotated[int, typer.Option(min=0, help="T; T + 1 views are taken.")] = 5,
+    split: Split = "test",
+    moves: Annotated[int, typer.Option(min=0, help="Number of moves T; T + 1 views are taken.")] = 5,
     seed: Seed = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """Say how much the choice of views matters: shares of objects that some view shows at least half of.
+    """Print the share of objects that are at least half visible in one view, and in several chosen views.
 
     Example: [bold]active6d scenes report --object mug --split test[/bold]
     """
@@ -67,7 +68,7 @@ def report(
     table.add_column(style="dim")
     table.add_column(justify="right")
     table.add_row("scenes", str(len(scenes)))
-    table.add_row("objects a scene", f"{min(counts)}-{max(counts)}")
+    table.add_row("objects per scene", f"{min(counts)}-{max(counts)}")
     titles = {
         "one_view": "one view",
         "random": f"{moves + 1} random views",
@@ -85,22 +86,22 @@ def report(
 
 @app.command()
 def show(
-    scene_name: Annotated[str, typer.Argument(metavar="NAME", help="Such as mug/test/3 or mug/seed/7.")],
-    png: Annotated[Path, typer.Option(metavar="FILE", help="Where to write the picture.")] = Path("scene.png"),
+    scene_name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name of the scene, such as mug/test/3 or mug/seed/7.")
+    ],
+    png: Annotated[Path, typer.Option(metavar="FILE", help="PNG file to write.")] = Path("scene.png"),
     view: Annotated[
-        list[int] | None, typer.Option(min=0, help="View of the grid; repeatable. Four around by default.")
+        list[int] | None,
+        typer.Option(min=0, help="Number of a view of the grid; repeatable. By default four views around the bin."),
     ] = None,
-    noise: Annotated[float, typer.Option(min=0.0, help="Factor on the sensor's noise.")] = 1.0,
+    noise: Annotated[float, typer.Option(min=0.0, help="Factor on the noise of the simulated sensor.")] = 1.0,
     seed: Seed = 0,
 ) -> None:
-    """Draw a scene as the camera sees it: colour above, depth below.
+    """Render views of a scene: colour above, depth below.
 
     Example: [bold]active6d scenes show mug/test/3 --png scene.png[/bold]
     """
-    import io
-
     import numpy as np
-    from PIL import Image
 
     from active6d_core.object_model import load_object
     from active6d_core.view_sphere import ViewSphere
@@ -118,16 +119,14 @@ def show(
         raise ValueError(f"scene '{scene_name}' is not of the form mug/test/3 or mug/seed/7")
     object_name, kind, number = parts
     load_object(object_name)
-    with messages.status("dropping and rendering"):
+    with messages.status("simulating and rendering"):
         scene = find_scene(object_name, "" if kind == "seed" else scene_name, int(number) if kind == "seed" else seed)
         simulator = Simulator(scene, noise=SensorNoise().scaled(noise), seed=seed)
         columns = []
         for index in views:
             image = simulator.capture(sphere.pose(sphere.positions[index]), (index + 1) * 1_000_000_000)
             columns.append(np.vstack([image.color, depth_to_color(image.depth)[0]]))
-        buffer = io.BytesIO()
-        Image.fromarray(np.hstack(columns)).save(buffer, "PNG")
-        write_file(png, buffer.getvalue())
+        write_png(png, np.hstack(columns))
     for index in views:
         fraction = scene.visible_fraction[index]
         shown = f"{(fraction >= 0.5).sum()} of {len(scene)} objects at least half visible"

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from active6d_core.object_model import ObjectModel
     from active6d_perception.estimators.dense.training.loop import TrainingOptions
 
-app = typer.Typer(help="Train what is learned.", rich_markup_mode="rich")
+app = typer.Typer(help="Train the pose estimator or a policy.", rich_markup_mode="rich")
 
 _DATA = "Folder of the views and checkpoints; by default active6d/training/OBJECT in the cache folder."
 
