@@ -1,9 +1,10 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo results test lint clean
+.PHONY: help setup demo results check test lint clean
 
 BIN := .venv/bin
 DEMO := bags/demo
+PYTHON_FILES := src tests examples
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -22,8 +23,13 @@ results: setup  ## what docs/results.md shows and is not measured yet, except tr
 test: setup  ## all tests
 	$(BIN)/python -m pytest tests
 
-lint: setup  ## ruff on all Python files
-	$(BIN)/ruff check src tests
+check: lint  ## what needs no run: lint, format, types, layers, links of the documentation
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q --durations=0 --durations-min=60 tests/core/test_layers.py $(wildcard tests/packaging/test_docs.py)
+
+lint: setup  ## ruff: lint and format of all Python files
+	$(BIN)/ruff check $(PYTHON_FILES)
+	$(BIN)/ruff format --check $(PYTHON_FILES)
 
 clean:  ## remove .venv, builds and the demo
-	rm -rf .venv ros2_ws/{build,install,log} $(DEMO) src/*/*.egg-info src/*/build .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv ros2_ws/{build,install,log} $(DEMO) src/*/*.egg-info src/*/build .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -248,7 +248,7 @@ def _chunks(count: int, width: int) -> list[slice]:
 
 
 def _point_error(
-    model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, reduce: Callable, cutoff: float
+    model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, reduce: Callable[..., np.ndarray], cutoff: float
 ) -> np.ndarray:
     """Min over S of ``reduce`` (mean or max) over x of ``||T_est x - T_gt S x||``."""
     leading, T_est, T_gt = _flatten(T_est, T_gt)

@@ -8,6 +8,7 @@ import os
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -178,7 +179,7 @@ def find_beside(file_name: str, shipped: Path) -> Path:
     return next((path for path in beside if path.is_file()), shipped / file_name)
 
 
-def _load_mesh(description: dict, path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
+def _load_mesh(description: dict[str, Any], path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
     """The mesh of ``mesh`` (a file) or ``profile`` ((r, z) rows revolved about z), scaled, origin at its centroid.
 
     Also returns (3,) that centroid in the file's frame, metres.
@@ -195,7 +196,7 @@ def _load_mesh(description: dict, path: Path) -> tuple[trimesh.Trimesh, np.ndarr
     scale = float(description.get("scale", 1.0))
     if not 0 < scale < np.inf:
         raise ValueError(f"scale must be positive, got {scale}")
-    mesh.apply_scale(scale)
+    mesh.apply_scale(scale)  # type: ignore[no-untyped-call]
     if not len(mesh.faces) or mesh.volume <= 0:
         raise ValueError("mesh has no faces, or its faces point inwards (negative volume)")
     # With the origin at the mass centre, physics needs no inertial offset and rotation errors do not leak into ADD.
@@ -208,7 +209,7 @@ def _diameter(mesh: trimesh.Trimesh) -> float:
     return float(pdist(np.asarray(mesh.convex_hull.vertices)).max())
 
 
-def _read_symmetry(description: dict) -> Symmetry:
+def _read_symmetry(description: dict[str, Any]) -> Symmetry:
     unknown = description.keys() - {"axis", "discrete_rotvec_degrees"}
     if unknown:
         raise ValueError(f"symmetry has unknown keys {sorted(unknown)}")

@@ -5,6 +5,7 @@ Every function broadcasts over leading dimensions. Quaternions are scalar-last (
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 
@@ -67,7 +68,7 @@ def is_rigid(T: np.ndarray, tolerance: float = 1e-6) -> bool:
     return bool(orthonormal and right_handed and np.abs(T[..., 3, :] - [0, 0, 0, 1]).max(initial=0.0) < tolerance)
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray = (0.0, 0.0, 1.0)) -> np.ndarray:
+def look_at(eye: np.ndarray, target: np.ndarray, up: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
     """``T_world_camera`` (4, 4) of an optical frame (z forward, x right, y down; REP-103) at ``eye`` facing ``target``.
 
     Straight up or down, where ``up`` gives no direction, the image's top points to world +y.
@@ -81,7 +82,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray = (0.0, 0.0, 1.0
     if distance < 1e-9:
         raise ValueError("look_at needs an eye that differs from its target")
     forward /= distance
-    right = np.cross(forward, up)
+    right = np.cross(forward, np.asarray(up, float))
     if np.linalg.norm(right) < 1e-6:
         right = np.cross(forward, (0.0, 1.0, 0.0))
     right /= np.linalg.norm(right)

@@ -130,6 +130,7 @@ class EpisodeState:
         return True
 
     def _strike(self) -> None:
+        assert self._goal is not None, "only a goal on its way can be missed"
         self._struck[self._limits.sphere.nearest(self._goal)] = True
         self._goal = None
 

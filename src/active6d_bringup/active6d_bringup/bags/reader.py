@@ -186,7 +186,7 @@ def _read_messages(folder: Path) -> tuple[dict[str, dict[int, Any]], dict[int, d
             names = topic_names(reader.connections, folder)
             wanted = [connection for connection in reader.connections if connection.topic in names]
             for connection, _, payload in reader.messages(wanted):
-                message = TYPESTORE.deserialize_cdr(payload, connection.msgtype)
+                message: Any = TYPESTORE.deserialize_cdr(payload, connection.msgtype)
                 topic = names[connection.topic]
                 if topic == "/diagnostics":
                     latencies[stamp_to_ns(message.header.stamp)].update(latencies_from_diagnostics(message))

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 from pathlib import Path
+from typing import Literal
 
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -170,7 +171,7 @@ def stamp_of(message_type: str, payload: bytes) -> int:
 
     The header comes first in every type of the contract but MarkerArray, whose first marker's header counts.
     """
-    order = "little" if payload[1] & 1 else "big"
+    order: Literal["little", "big"] = "little" if payload[1] & 1 else "big"
     offset = 4
     if message_type.endswith("/MarkerArray"):
         if int.from_bytes(payload[4:8], order) == 0:

@@ -297,7 +297,7 @@ class ExpectedVisibility:
         """
         eyes = np.ascontiguousarray(eyes, np.float32)
         stand = self._stand(T_world_object, eyes)
-        walls = Tray(*np.float32(OPEN_TABLE if tray is None else tray))
+        walls = Tray(*np.array(OPEN_TABLE if tray is None else tray, np.float32))
         hiding = len(T_world_object) if hiding is None else hiding
         return _shares(self._disc, eyes, walls, stand, hiding, self._silhouettes)
 

@@ -102,7 +102,7 @@ class Verifier:
         """
         height, width = depth.shape
         corners = np.rint(np.clip(np.nan_to_num(hypotheses.box), 0.0, 1.0) * (width, height, width, height)).astype(int)
-        images = np.require(hypotheses.segmentation, np.uint16, "CW"), np.require(depth, np.float32, "CW")
+        images = np.require(hypotheses.segmentation, np.uint16, ["C", "W"]), np.require(depth, np.float32, ["C", "W"])
         return _pixels_in_boxes(*images, corners, hypotheses.label.astype(np.uint16), self.samples)
 
 
@@ -124,7 +124,7 @@ def points_and_normals(
         (n, 3) points in the optical frame and (n, 3) unit normals facing the camera, zero where both sides are missing.
     """
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-    return _points_and_normals(np.require(depth, np.float32, "CW"), intrinsics, np.asarray(pixels), reach)
+    return _points_and_normals(np.require(depth, np.float32, ["C", "W"]), intrinsics, np.asarray(pixels), reach)
 
 
 _Vector = tuple[float, float, float]

@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+__all__ = ["BulletClient", "connect", "decompose", "pybullet", "silence"]
 _LIBC = ctypes.CDLL(None)
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
 TEXTURE_SIZE = 512
@@ -92,6 +93,6 @@ class Appearance:
         return np.clip(factors, 0.2, 1.8).astype(np.float32)
 
 
-def _tiling_noise(rng: np.random.Generator, sigma: tuple[float, float]) -> np.ndarray:
+def _tiling_noise(rng: np.random.Generator, sigma: ArrayLike) -> np.ndarray:
     noise = gaussian_filter(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE)).astype(np.float32), sigma, mode="wrap")
     return noise / noise.std()

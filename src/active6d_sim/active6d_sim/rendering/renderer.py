@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import open3d as o3d
 import trimesh
+from numpy.typing import ArrayLike
 
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, pixel_rays
 from active6d_core.object_model import ObjectModel, load_object
@@ -244,7 +245,15 @@ class SceneRenderer:
         factor[ground] = self._textures[layer, row * TEXTURE_SIZE + column]
         return factor
 
-    def _add_highlights(self, light, lit, normals, material, directions, key) -> None:
+    def _add_highlights(
+        self,
+        light: np.ndarray,
+        lit: np.ndarray,
+        normals: np.ndarray,
+        material: np.ndarray,
+        directions: np.ndarray,
+        key: np.ndarray,
+    ) -> None:
         """Blinn-Phong highlights of the key light on objects."""
         glossy = lit[material[lit] >= _FIRST_INSTANCE]
         view = -directions[glossy]
@@ -253,7 +262,9 @@ class SceneRenderer:
         strength = self._look.shininess * np.maximum(np.einsum("ij,ij->i", normals[glossy], half), 0) ** 48
         light[glossy] += strength[:, None] * np.array(self._look.key_color, np.float32)
 
-    def _paint_backdrop(self, light, points, material, directions) -> None:
+    def _paint_backdrop(
+        self, light: np.ndarray, points: np.ndarray, material: np.ndarray, directions: np.ndarray
+    ) -> None:
         """A plain backdrop that the table fades into with distance."""
         backdrop = np.array(self._look.backdrop, np.float32)
         light[material == _BACKDROP] = backdrop
@@ -318,7 +329,9 @@ def _build_soup(mesh: trimesh.Trimesh, scene: Scene) -> _Soup:
     )
 
 
-def _patch(origin, along_u, along_v, rows: np.ndarray, columns: np.ndarray):
+def _patch(
+    origin: ArrayLike, along_u: ArrayLike, along_v: ArrayLike, rows: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A rectangle of quads at fractions ``rows`` and ``columns`` of its sides; its normal is u x v."""
     origin, along_u, along_v = (np.array(value, float) for value in (origin, along_u, along_v))
     v, u = np.meshgrid(rows, columns, indexing="ij")
@@ -330,7 +343,7 @@ def _patch(origin, along_u, along_v, rows: np.ndarray, columns: np.ndarray):
     return vertices, np.broadcast_to(normal / np.linalg.norm(normal), vertices.shape), faces
 
 
-def _table(bin: Bin):
+def _table(bin: Bin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The table, fine near the bin, where its ambient occlusion changes."""
     reach = min(1.5 * max(bin.inner_width, bin.inner_depth) / _TABLE_HALF_WIDTH, 0.9)
     lines = np.concatenate([[0.0], 0.5 + 0.5 * reach * np.linspace(-1, 1, 64), [1.0]])

@@ -90,6 +90,8 @@ def apply(
     Returns:
         (H, W, 3) uint8 colour, and (H, W) float32 depth in metres with NaN for missing returns.
     """
+    if rendered.color is None:
+        raise ValueError("the view was rendered without colour")
     missing = rng.random(rendered.depth.shape, np.float32) < _loss(rendered, camera, noise)
     depth = _jittered(rendered.depth, noise.jitter, rng)
     if noise.disparity > 0:

@@ -137,7 +137,8 @@ def gather_patches(points: np.ndarray, diameter: float) -> np.ndarray:
     thinning = max(1, -(-len(points) // _MOST_POINTS))
     points = points[::thinning]
     near = cdist(points, points) < _PATCH_RADIUS * diameter
-    middles, free = [], np.ones(len(points), bool)
+    middles: list[np.ndarray] = []
+    free = np.ones(len(points), bool)
     while len(middles) < MAX_PATCHES and free.any():
         count = near @ free.astype(np.float32) * free
         members = near[count.argmax()] & free
