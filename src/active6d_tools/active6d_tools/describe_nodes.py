@@ -57,7 +57,7 @@ def endpoints(node: GraphNode) -> Iterator[tuple[str, str, str, str]]:
                 direction,
                 relative(endpoint.topic_name),
                 f"{module}/{endpoint.msg_type.__name__}",
-                "latched" if latched else "",
+                "transient local" if latched else "",
             )
     for service in sorted(node.services, key=lambda service: service.srv_name):
         module = service.srv_type.__module__.split(".")[0]
