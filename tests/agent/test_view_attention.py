@@ -20,9 +20,9 @@ from active6d_agent.policies.view_attention import dagger as dagger
 from active6d_agent.policies.view_attention import features as scene_state
 from active6d_agent.policies.view_attention.features import (
     best_verified,
+    cluster_unexplained,
     gather,
-    gather_patches,
-    guess_middle,
+    likely_centre,
     represent,
 )
 from active6d_agent.policies.view_attention.network import (
@@ -98,7 +98,7 @@ def test_the_order_of_earlier_views_does_not_matter(network, observation):
 
 @pytest.mark.parametrize("name", ["mug", "coffee_cup"])
 def test_turning_the_world_about_the_vertical_turns_the_values(name, observation):
-    """By a quarter, for the tray is square: the value of a view moves on to the view five further. Without patches, as
+    """By a quarter, for the tray is square: the value of a view moves on to the view five further. Without clusters, as
     what stands in for them does not turn with the world."""
     torch.manual_seed(1)
     network = ViewAttention().eval()
@@ -163,7 +163,7 @@ def test_nothing_is_left_to_gain_after_the_last_move(network, observation):
 
 
 def test_pairs_begin_with_what_views_show(network, observation, lookup):
-    """Of objects and of what patches are guessed to be, and how much more that is than the best view has shown."""
+    """Of objects and of the likely objects of clusters, and how much more that is than the best view has shown."""
     pairs = gather(states([observation]))["pairs"]
     best, seen, shown = shown_of_items(observation, lookup)
     n = len(best)
@@ -179,7 +179,8 @@ def shown_of_items(observation, lookup):
     model, turn = lookup.model, np.eye(3)
     surface = observation.unexplained
     guessed = [
-        make_transform(turn, guess_middle(surface, patch, model)) for patch in gather_patches(surface, model.diameter)
+        make_transform(turn, likely_centre(surface, patch, model))
+        for patch in cluster_unexplained(surface, model.diameter)
     ]
     visibility, items = expected_visibility(model), np.concatenate([best, guessed])
     tray = Tray.for_model(model)
@@ -403,8 +404,8 @@ def test_labels_tell_which_object_gains(lookup):
     assert len(gains) == len(order) + 1
 
 
-def test_a_patch_stands_for_the_nearest_object_without_a_hypothesis(lookup):
-    """Its gain moves from what nobody stands for to the patch; nothing else changes."""
+def test_a_cluster_stands_for_the_nearest_object_without_a_hypothesis(lookup):
+    """Its gain moves from what nobody stands for to the cluster; nothing else changes."""
     taken, true = np.array([8]), lookup.bank.scenes[1].T_world_object[:, :3, 3]
     plain = dagger.candidate_gains(lookup, 1, taken, 3, NO_PATCH)[0]
     stood_for = lookup.nearest_object[lookup.fuse(np.array([1]), taken[None], taken).objects[0]]
@@ -421,14 +422,14 @@ def test_a_patch_stands_for_the_nearest_object_without_a_hypothesis(lookup):
         assert near[view, 0] == (found < 0.1 * lookup.model.diameter)
 
 
-def test_patches_are_balls_of_what_is_unexplained():
+def test_clusters_are_balls_of_what_is_unexplained():
     rng = np.random.default_rng(0)
     large, small = rng.normal(0, 0.004, (60, 3)), rng.normal(0, 0.004, (20, 3)) + [0.2, 0.0, 0.0]
     lonely = np.array([[0.0, 0.3, 0.0]])
-    middles = gather_patches(rng.permutation(np.concatenate([small, large, lonely])), 0.1)
+    middles = cluster_unexplained(rng.permutation(np.concatenate([small, large, lonely])), 0.1)
     np.testing.assert_allclose(middles, [large.mean(axis=0), small.mean(axis=0)], atol=1e-9)
-    assert len(gather_patches(rng.uniform(-0.3, 0.3, (2000, 3)) * [1, 1, 0], 0.1)) == 8
-    assert gather_patches(np.zeros((0, 3)), 0.1).shape == (0, 3)
+    assert len(cluster_unexplained(rng.uniform(-0.3, 0.3, (2000, 3)) * [1, 1, 0], 0.1)) == 8
+    assert cluster_unexplained(np.zeros((0, 3)), 0.1).shape == (0, 3)
 
 
 @pytest.mark.parametrize("name", ["bunny", "coffee_cup", "mug"])
@@ -440,13 +441,13 @@ def test_the_middle_is_guessed_behind_the_surface_that_shows(name):
         depth = points @ R.T @ towards
         shown = (points @ R.T)[depth > np.quantile(depth, 2 / 3)] + middle
         patch = shown.mean(axis=0)
-        off.append([np.linalg.norm(each - middle) for each in (guess_middle(shown, patch, model), patch)])
+        off.append([np.linalg.norm(each - middle) for each in (likely_centre(shown, patch, model), patch)])
     guessed, plain = np.mean(off, axis=0) / model.diameter
     assert guessed < 0.75 * plain
 
 
 def test_unexplained_surface_is_counted_about_every_item(observation, lookup):
-    """Within 0.35 and 0.65 diameters of objects and patches alike, fifty points being one."""
+    """Within 0.35 and 0.65 diameters of objects and clusters alike, fifty points being one."""
     state, surface = states([observation])[0], observation.unexplained
     assert len(surface) > 50
     for centre, scalars in zip(state.pose[:, :, 3], state.scalars, strict=True):

@@ -42,7 +42,7 @@ def compare_true_poses(model: ObjectModel) -> None:
 def compare_missed(model: ObjectModel) -> None:
     """Over the grid's views, of each missed object, what the item shows that stands for it: the mean correlation."""
     lookup, rng = BatchedFusion(load_bank(find_bank(model.name, "val"))), np.random.default_rng(0)
-    correlations: dict[str, list[float]] = {"a hypothesis": [], "a patch": []}
+    correlations: dict[str, list[float]] = {"a hypothesis": [], "a cluster": []}
     for index in range(SPLITS["val"]):
         rendered = load_scene(model.name, "val", index).visible_fraction
         for count in np.repeat(VIEWS, CHOICES):
@@ -51,10 +51,10 @@ def compare_missed(model: ObjectModel) -> None:
             state = represent(observe(lookup, scene, views, np.array([1]))[0], model)
             rows = lookup.fuse(scene, views, views[:, -1]).objects[0]
             missed = known(lookup, scene, views)[0, :, 0] == 0
-            for item, true in zip(*stand_for(lookup, index, rows, state.patches), strict=True):
+            for item, true in zip(*stand_for(lookup, index, rows, state.clusters), strict=True):
                 if missed[true] and np.ptp(state.shown[item]) > 0:
                     correlation = np.corrcoef(state.shown[item], rendered[:, true])[0, 1]
-                    correlations["a patch" if state.scalars[item, 4] else "a hypothesis"].append(correlation)
+                    correlations["a cluster" if state.scalars[item, 4] else "a hypothesis"].append(correlation)
     for what, values in correlations.items():
         print(f"{model.name} missed, {what} stands for it: {len(values)}, correlation {np.mean(values):.3f}")
 

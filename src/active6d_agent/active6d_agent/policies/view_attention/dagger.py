@@ -1,8 +1,8 @@
-"""Training ``view-attention`` on a scene bank: train_dagger what the truth says of every view.
+"""Training ``view-attention`` on a scene bank by imitation (DAgger).
 
-The truth says for every candidate view what it would gain, and what could still be gained after it, by a fixed rule for
-the moves that remain: views that lie far from all taken ones (:func:`spread`). So one visited state teaches a hundred
-views. States are those that the learner itself comes to (DAgger), with some random moves and budgets of every length.
+The ground truth gives the gain of every candidate view, and the gain of the moves after it under a fixed rule: views
+far from all taken ones (:func:`spread`). So one visited state labels a hundred views. The states are those that the
+learner visits itself, with some random moves and with budgets of every length.
 """
 
 import json
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.optim.lr_scheduler import CosineAnnealingLR
 from torch.optim.swa_utils import AveragedModel
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
@@ -35,16 +36,18 @@ from active6d_core.view_sphere import ViewSphere
 
 # Episodes that the network values together: more are no faster and need memory.
 _TOGETHER = 32
-# The weights that play are a mean over about as many steps as four rounds have.
+# The averaged weights are a mean over about as many steps as four rounds have.
 _MEAN_DECAY = 0.995
-# What is tried for the weighing.
+# The learning rate at the end, over that at the beginning.
+_LOWEST_RATE = 0.02
+# Values that are tried for the weighing.
 _LOOKAHEADS = (0.0, 0.25, 0.5, 1.0)
 _METRES_WEIGHTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
-# A patch is surface of a true object whose middle is within this fraction of the diameter.
-_PATCH_REACH = 0.75
-# Of the loss about all gains to the end, against that about the next view's.
+# A cluster of unexplained surface belongs to a true object within this fraction of the diameter of its likely centre.
+_CLUSTER_REACH = 0.75
+# Weight of the loss of all gains to the end, against that of the next view's.
 _LATER_WEIGHT = 0.1
-# Variance over a state's views, in objects squared, that counts as none.
+# Variance over a state's views, in objects squared, below which all states count the same.
 _VARIANCE_FLOOR = 0.1
 
 
@@ -60,14 +63,14 @@ class DaggerParameters:
         updates: steps of the optimiser each round.
         batch: states per step.
         views: of each state that one step learns from.
-        learning_rate: of Adam at first; falls to nothing along a cosine.
-        explore: share of random moves.
+        learning_rate: of Adam at first; falls to 2 % of it along a cosine.
+        explore: share of random moves, in [0, 1].
         capacity: states kept, the latest.
         starts: validation episodes.
         evaluate_every: rounds between validations.
-        object_weight: of the loss about single objects, against that about a view's sum.
+        object_weight: of the loss of single objects, against that of a view's sum.
         hidden: width of the network.
-        seed: of everything.
+        seed: of the weights, the episodes and the batches.
 
     Raises:
         ValueError: a value is out of range.
@@ -124,10 +127,10 @@ class DaggerProgress:
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """One state and what its views gain.
+    """One state and the gains of its views.
 
     Attributes:
-        state: what was known.
+        state: the network's input.
         now: (M, n + 1, 2) :func:`candidate_gains`.
         later: (M, n + 1, 2) likewise.
     """
@@ -149,15 +152,14 @@ def train_dagger(
     """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
 
     ``folder`` receives ``curve.jsonl``, ``best.safetensors`` (highest validation detection rate, lower e_ADD of equals)
-    and ``latest.safetensors``, each with its JSON. At the end the best is given the weighing that suits it
-    (:func:`choose_weighing`).
+    and ``latest.safetensors``, each with its JSON. At the end the best gets its weighing by :func:`choose_weighing`.
 
     Args:
         train: scenes to train on.
         validation: scenes to choose the best on.
         folder: of the results.
         parameters: how to train.
-        weighing: what counts for the learner.
+        weighing: of gains and travel, for the learner's moves.
         resume: go on from ``latest`` with newly collected states.
 
     Raises:
@@ -200,11 +202,12 @@ def settle(path: Path, validation: BatchedFusion, starts: np.ndarray, steps: int
 
 
 def choose_weighing(network: ViewAttention, validation: BatchedFusion, starts: np.ndarray, steps: int) -> Weighing:
-    """The weight of later gains that finds most on the validation scenes, then likewise that of metres, among those
-    that make no longer ways than the random policy does.
+    """The lookahead with the highest detection rate on the validation scenes, then likewise the weight of metres.
+
+    Weights of metres count only if the network travels no farther than the random policy.
 
     Args:
-        network: whose weighing is the beginning, and stays as it is otherwise.
+        network: whose weighing is the start; it is not changed.
         validation: scenes to choose on.
         starts: (E, 2) scenes and first views.
         steps: moves T.
@@ -233,7 +236,7 @@ def validate(
 
 
 def greedy(network: ViewAttention, model: ObjectModel) -> Choose:
-    """Always the view of most worth."""
+    """Always the view of highest worth."""
 
     def choose(_: np.ndarray, observations: list[Observation]) -> np.ndarray:
         states = [represent(each, model) for each in observations]
@@ -243,7 +246,7 @@ def greedy(network: ViewAttention, model: ObjectModel) -> Choose:
 
 
 def _worths(network: ViewAttention, observations: list[Observation], states: list[SceneState]) -> np.ndarray:
-    """(B, M) worth of every view by what the network weighs."""
+    """(B, M) worth of every view by the network's weighing."""
     parts = [slice(start, start + _TOGETHER) for start in range(0, len(observations), _TOGETHER)]
     values = [value_views(network, observations[part], states[part], network.weighing) for part in parts]
     return np.concatenate([each.worth for each in values])
@@ -251,7 +254,7 @@ def _worths(network: ViewAttention, observations: list[Observation], states: lis
 
 def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
     """(E, v) views to (E, v + moves): each next one is the view at 60 degrees farthest from all taken ones, the nearest
-    of equals. It needs nothing but geometry, and can go on from any views."""
+    of equals. The rule needs geometry only."""
     arcs = sphere.arc(sphere.positions[:, None], sphere.positions)
     elevation = np.arcsin(sphere.positions[:, 2] / sphere.radius)
     ring = np.flatnonzero(np.isclose(elevation, elevation[np.abs(elevation - np.pi / 3).argmin()]))
@@ -262,15 +265,16 @@ def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
 
 
 def candidate_gains(
-    lookup: BatchedFusion, scene: int, views: np.ndarray, left: int, patches: np.ndarray
+    lookup: BatchedFusion, scene: int, views: np.ndarray, left: int, clusters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What each view adds to the (v,) views taken, and what :func:`spread` adds in the moves that are left after it.
+    """The gain of each view after the (v,) views taken, and that of :func:`spread` in the moves left after it.
+
+    An item is an accumulated object, in the order of :func:`.features.best_verified`, or one of the (m, 3) likely
+    centres ``clusters``. Of several items for one true object the first has the gain.
 
     Returns:
-        Twice (M, n + 1, 2), NaN for views taken: gains (:func:`.oracle.known`) of the true objects that
-        the n items stand for, which are the accumulated objects in the order of
-        :func:`.features.best_verified` and the (m, 3) middles ``patches``; of several for one true
-        object the first has the gain. Last, what all true objects gain that none stands for.
+        Twice (M, n + 1, 2), NaN for views taken: gains (:func:`.oracle.known`) of the true objects that the n items
+        stand for; last, the sum over the true objects that no item stands for.
     """
     free = np.setdiff1d(np.arange(len(lookup.sphere)), views)
     paths = np.column_stack([np.tile(views, (len(free), 1)), free])
@@ -279,8 +283,8 @@ def candidate_gains(
         known(lookup, np.full(len(free), scene), each) for each in (paths, spread(lookup.sphere, paths, left - 1))
     )
     rows = lookup.fuse(np.array([scene]), views[None], views[-1:]).objects[0]
-    column, stands_for = stand_for(lookup, scene, rows, patches)
-    count = min(len(rows), MAX_OBJECTS) + len(patches)
+    column, stands_for = stand_for(lookup, scene, rows, clusters)
+    count = min(len(rows), MAX_OBJECTS) + len(clusters)
     gains = np.full((2, len(lookup.sphere), count + 1, GAINS), np.nan)
     gains[:, free] = 0.0
     for part, added in zip(gains, (after - before, ended - after), strict=True):
@@ -290,36 +294,41 @@ def candidate_gains(
 
 
 def stand_for(
-    lookup: BatchedFusion, scene: int, rows: np.ndarray, patches: np.ndarray
+    lookup: BatchedFusion, scene: int, rows: np.ndarray, clusters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Items that stand for true objects, and those objects: an accumulated object, of the hypotheses ``rows``, for the
-    one that it is best for; a patch for the nearest that no accumulated object stands for."""
+    """Items that stand for true objects, and those objects.
+
+    An accumulated object, given by its hypothesis in ``rows``, stands for the true object that it is nearest to in
+    e_ADD. A cluster of unexplained surface stands for the nearest true object without an accumulated one.
+    """
     order = np.argsort(-lookup.verification[rows], kind="stable")
     stands_for, best = np.unique(lookup.nearest_object[rows], return_index=True)
     column = np.argsort(order)[best]
-    told = column < MAX_OBJECTS
-    stands_for, column = stands_for[told], column[told]
+    given = column < MAX_OBJECTS
+    stands_for, column = stands_for[given], column[given]
     true = lookup.bank.scenes[scene].T_world_object[:, :3, 3]
-    apart = np.linalg.norm(patches[:, None] - true, axis=-1)
+    apart = np.linalg.norm(clusters[:, None] - true, axis=-1)
     apart[:, stands_for] = np.inf
-    for patch, distances in enumerate(apart):
+    for cluster, distances in enumerate(apart):
         nearest = int(distances.argmin())
-        if distances[nearest] < _PATCH_REACH * lookup.model.diameter:
+        if distances[nearest] < _CLUSTER_REACH * lookup.model.diameter:
             stands_for = np.append(stands_for, nearest)
-            column = np.append(column, min(len(rows), MAX_OBJECTS) + patch)
+            column = np.append(column, min(len(rows), MAX_OBJECTS) + cluster)
             apart[:, nearest] = np.inf
     return column, stands_for
 
 
 class _Learner:
-    """The network, its optimiser and the states that it learns from."""
+    """The network, its optimiser and the labelled states."""
 
     def __init__(self, lookup: BatchedFusion, parameters: DaggerParameters, weighing: Weighing) -> None:
         torch.manual_seed(parameters.seed)
         self.lookup, self.parameters, self._weighing = lookup, parameters, weighing
         self._trained = ViewAttention(parameters.hidden)
         self.optimizer = torch.optim.Adam(self._trained.parameters(), parameters.learning_rate, weight_decay=1e-5)
-        # What plays and is kept is a running mean of the weights: it does better on other scenes than the latest.
+        lowest = _LOWEST_RATE * parameters.learning_rate
+        self._schedule = CosineAnnealingLR(self.optimizer, parameters.rounds, lowest)
+        # The running mean of the weights makes the moves and is stored: it does better on other scenes than the latest.
         self._average = AveragedModel(self._trained, avg_fn=_running_mean).eval()
         self.network: ViewAttention = self._average.module
         self.network.weighing = weighing
@@ -336,52 +345,53 @@ class _Learner:
         provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
         progress = provenance["progress"]
         self.round, self.states = progress["round"], progress["states"]
-        # The same scenes again would be the seed's; go on with others.
+        self.optimizer.step()  # without gradients it does nothing; the schedule expects it first
+        for _ in range(self.round):
+            self._schedule.step()
+        # The seed alone would draw the same scenes again.
         self.rng = np.random.default_rng([self.parameters.seed, self.round])
         return tuple(provenance["best"]), progress["seconds"]
 
     def advance(self) -> float:
-        """One round; its mean loss."""
+        """Run one round and return its mean loss."""
         self._collect()
-        share = self.round / self.parameters.rounds
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.parameters.learning_rate * (0.02 + 0.98 * (1 + np.cos(np.pi * share)) / 2)
         loss = float(np.mean([self._update() for _ in range(self.parameters.updates)]))
+        self._schedule.step()
         self.round += 1
         return loss
 
     def _collect(self) -> None:
-        """Play episodes as the learner does now, and label every state on the way."""
+        """Run episodes with the current network and label every state."""
         lookup, rng, count = self.lookup, self.rng, self.parameters.episodes
         scene = rng.integers(len(lookup.bank.scenes), size=count)
         moves = rng.integers(1, self.parameters.longest + 1, size=count)
         start = rng.integers(len(lookup.sphere), size=count)
         paths = [[view] for view in start]
-        # The oracle leads until the learner has learned something.
-        lead = max(0.0, 1.0 - 5.0 * self.round / self.parameters.rounds)
+        # The oracle chooses most views in the first fifth of the training.
+        by_oracle = max(0.0, 1.0 - 5.0 * self.round / self.parameters.rounds)
 
         def choose(running: np.ndarray, observations: list[Observation]) -> np.ndarray:
             states = [represent(each, lookup.model) for each in observations]
             values = _worths(self.network, observations, states)
             gains = [
-                candidate_gains(lookup, scene[index], np.array(paths[index]), each.steps_left, state.patches)
+                candidate_gains(lookup, scene[index], np.array(paths[index]), each.steps_left, state.clusters)
                 for index, each, state in zip(running, observations, states, strict=True)
             ]
             self.memory.extend(Example(state, *both) for state, both in zip(states, gains, strict=True))
             self.states += len(observations)
             truths = [(now + later).sum(axis=1) @ [1.0, self._weighing.error_weight] for now, later in gains]
-            best = [self._best(truth, worth, lead) for truth, worth in zip(truths, values, strict=True)]
+            best = [self._best(truth, worth, by_oracle) for truth, worth in zip(truths, values, strict=True)]
             for index, view in zip(running, best, strict=True):
                 paths[index].append(view)
             return np.array(best)
 
         roll_out(lookup, choose, scene, start, moves)
 
-    def _best(self, truth: np.ndarray, worth: np.ndarray, lead: float) -> int:
+    def _best(self, truth: np.ndarray, worth: np.ndarray, by_oracle: float) -> int:
         """The next view of a training episode."""
         if self.rng.random() < self.parameters.explore:
             return int(self.rng.choice(np.flatnonzero(np.isfinite(worth))))
-        return int(np.nanargmax(truth) if self.rng.random() < lead else worth.argmax())
+        return int(np.nanargmax(truth) if self.rng.random() < by_oracle else worth.argmax())
 
     def _update(self) -> float:
         drawn = [self.memory[i] for i in self.rng.integers(len(self.memory), size=self.parameters.batch)]
@@ -390,7 +400,7 @@ class _Learner:
         nows, laters = self._trained.explain(state)
         now = _labels([example.now for example in drawn], some, nows.shape[2])
         later = _labels([example.later for example in drawn], some, nows.shape[2])
-        # What comes next decides more than what may come after it, and is surer.
+        # The next view's gain decides more than later gains, and is less noisy.
         weight = self.parameters.object_weight
         loss = _loss(nows, now, weight) + _LATER_WEIGHT * _loss(nows + laters, now + later, weight)
         self.optimizer.zero_grad()
@@ -402,12 +412,12 @@ class _Learner:
 
 
 def _running_mean(mean: torch.Tensor, value: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
-    """Exponential, but at first over all there is, or it would remember where the training began."""
+    """Exponential moving average; at first over fewer steps, so that the initial weights do not count."""
     return torch.lerp(value, mean, torch.clamp((1 + count) / (10 + count), max=_MEAN_DECAY))
 
 
 def _labels(gains: list[np.ndarray], views: np.ndarray, count: int) -> np.ndarray:
-    """(B, M', count, 2) gains of (M',) views, padded before what no object stands for."""
+    """(B, M', count, 2) gains of (M',) views; padding is before the last row, the gain without an item."""
     padded = np.zeros((len(gains), len(views), count, GAINS), np.float32)
     for row, own in zip(padded, gains, strict=True):
         row[:, : own.shape[1] - 1], row[:, -1] = own[views, :-1], own[views, -1]
@@ -415,8 +425,10 @@ def _labels(gains: list[np.ndarray], views: np.ndarray, count: int) -> np.ndarra
 
 
 def _loss(predicted: torch.Tensor, truth: np.ndarray, object_weight: float) -> torch.Tensor:
-    """Square error of (B, M, n + 1, 2) gains where they are known: of their sums over the objects, of which the
-    differences between the views of a state count most, and of each object's."""
+    """Square error of (B, M, n + 1, 2) gains where they are labelled: of their sums over the items, and of each item.
+
+    Of the sums, differences between the views of a state count most.
+    """
     target = torch.from_numpy(truth)
     labelled = torch.isfinite(target[:, :, -1:, :1])
     off = torch.where(labelled, predicted - torch.nan_to_num(target), 0.0)
@@ -432,8 +444,8 @@ def _loss(predicted: torch.Tensor, truth: np.ndarray, object_weight: float) -> t
 def _weigh_states(truth: np.ndarray) -> torch.Tensor:
     """(B,) weights that sum to B: the less the gains of a state's views differ, the more each counts.
 
-    The first moves find many objects and the last ones few, which a plain square error hardly notices, though finding
-    them decides who wins.
+    The first moves find many objects and the last ones few. A plain square error would ignore the last ones, which
+    make the difference between policies.
     """
     weight = 1.0 / (np.nanvar(truth[..., 0].sum(axis=2), axis=1) + _VARIANCE_FLOOR)
     return torch.from_numpy((weight / weight.mean()).astype(np.float32))

@@ -1,8 +1,8 @@
-"""What ``view-attention`` looks at: accumulated objects, unexplained patches of surface, and what views show of them.
+"""Input features of ``view-attention``: of objects, of clusters of unexplained surface, and of views.
 
-A patch stands for an object that no hypothesis speaks of: depth images show some of its surface, and no accumulated
-object explains it. How much of each object and patch every view of the grid would show past the other objects comes
-from :mod:`active6d_perception.scene.expected_visibility`.
+A cluster of unexplained surface stands for an object without a hypothesis. Depth images show some of its surface, and
+no accumulated object explains that. An item is an accumulated object or such a cluster. How much of each item a view
+would show past the other objects comes from :mod:`active6d_perception.scene.expected_visibility`.
 """
 
 from collections.abc import Sequence
@@ -19,39 +19,40 @@ from active6d_perception.compiled import compiled
 from active6d_perception.model.model_views import model_views
 from active6d_perception.scene.expected_visibility import Tray, expected_visibility
 
-#: Patches beyond these are left out, the largest being kept.
-MAX_PATCHES = 8
-#: What is known of an item, of an item and a view, and of a view, see :class:`SceneState` and :func:`gather`.
+#: Clusters of unexplained surface beyond these are left out, the largest being kept.
+MAX_CLUSTERS = 8
+#: Number of features of an item, of an item and a view, and of a view, see :class:`SceneState` and :func:`gather`.
 ITEM_FEATURES, PAIR_FEATURES, VIEW_FEATURES = 18, 12, 8
-# Points of surface within this fraction of the diameter are one patch, and so many are needed.
-_PATCH_RADIUS = 0.45
+# Points within this fraction of the diameter are one cluster, and so many are needed.
+_CLUSTER_RADIUS = 0.45
 _FEWEST_POINTS = 4
-# More points than these are thinned out.
+# More points than these are subsampled.
 _MOST_POINTS = 240
-# Unexplained surface is counted within these distances of an item's middle, in diameters, and so many points are one.
-_NEAR_MIDDLE = (0.35, 0.65)
+# Unexplained points are counted within these distances of an item's centre, in diameters, in units of so many.
+_NEAR_CENTRE = (0.35, 0.65)
 _POINTS_OF_ONE = 50
-# Where the middle of an object is looked for about the middle of its patch, in diameters: most of it is below.
-_PLACES = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 5)] * 2, np.linspace(-0.5, 0.1, 4)), axis=-1).reshape(-1, 3)
-# Surface within this distance has a vote in that, in diameters, but no more points than these.
+# Candidates for an object's centre around the middle of its cluster, in diameters: most of the object is below.
+_CENTRES = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 5)] * 2, np.linspace(-0.5, 0.1, 4)), axis=-1).reshape(-1, 3)
+# Points within this distance vote for the centre, in diameters, but no more than these.
 _VOTERS_WITHIN = 0.7
 _MOST_VOTERS = 60
-# Standard deviation of the surface's distance from the middle that votes allow for, in diameters.
+# Standard deviation of the surface's distance from the centre that votes allow for, in diameters.
 _SHELL = 0.12
-# A twentieth of all votes more makes a place e times as likely.
+# A candidate with 5 % more of all votes counts e times as much.
 _SHARPNESS = 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class SceneState:
-    """n items, which are objects first and then patches, and the views about them.
+    """n items, first the objects and then the clusters of unexplained surface, and the views around them.
 
     Attributes:
-        pose: (n, 3, 4) in the world; a patch has the guessed middle of its object, and zeros for a rotation.
-        scalars: (n, 7) verification, score, spread in metres, share of the views that support the object; 1 for a
-            patch; unexplained surface near the middle and farther about it, of which right poses leave little.
-        shown: (n, M) share that each view of the grid would show past the objects in between.
-        seen: (n, t) the same of the views taken.
+        pose: (n, 3, 4) in the world; a cluster has the likely centre of its object, and zeros for a rotation.
+        scalars: (n, 7) verification score, estimator's score, spread in metres, share of the views that support the
+            object; 1 for a cluster; unexplained surface near the centre and in a wider ball. Correct poses leave
+            little of it.
+        shown: (n, M) share of the item's surface that each view of the grid would show past the objects in between.
+        seen: (n, t) the same for the views taken.
         taken: (t, 3) positions of the camera, the current one last.
         grid: (M, 3) positions of the views.
         left: moves left.
@@ -70,13 +71,13 @@ class SceneState:
     axis: np.ndarray
 
     @property
-    def patches(self) -> np.ndarray:
-        """(m, 3) where the middles of the patches' objects are guessed to be."""
+    def clusters(self) -> np.ndarray:
+        """(m, 3) likely centres of the objects that the clusters of unexplained surface belong to."""
         return self.pose[self.scalars[:, 4] > 0, :, 3]
 
     @cached_property
     def items(self) -> np.ndarray:
-        """(n, 18) float32, what is known of each by itself; of the world's directions only the vertical counts."""
+        """(n, 18) float32, features of each item; of the world's directions only the vertical counts."""
         verification, score, spread, *rest = self.scalars.T
         centre, upright = self.pose[:, :, 3], self.pose[:, 2, :3]
         apart = (centre - centre[:, None]) / self.diameter
@@ -101,10 +102,13 @@ class SceneState:
 
     @cached_property
     def outlooks(self) -> np.ndarray:
-        """(M, 8) float32, what is known of each view by itself: its height and the camera's, the ways to it from the
-        camera and from the nearest view taken, moves made and left, the number of items, and how near the end is."""
+        """(M, 8) float32, features of each view.
+
+        They are its height and the camera's, the arcs to it from the camera and from the nearest view taken, moves
+        made and left, the number of items, and 1 / (1 + moves left).
+        """
         outlook, heading = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (self.grid, self.taken))
-        # Just off the ends, where the angle has no derivative.
+        # Not quite 1 and -1, where the arc cosine has no derivative.
         arcs = np.arccos((outlook @ heading.T).clip(-1.0, 1.0) * np.float32(0.999999)) / np.float32(np.pi)
         moves, left = self._few(len(self.taken) - 1), self._few(self.left)
         known = np.empty((len(outlook), VIEW_FEATURES), np.float32)
@@ -115,31 +119,31 @@ class SceneState:
 
     @staticmethod
     def _few(moves: int) -> float:
-        """A number of moves in fives, of many only that there are many."""
+        """A number of moves over five, at most 2."""
         return min(moves / 5, 2.0)
 
 
 def best_verified(observation: Observation) -> np.ndarray:
-    """Indices of the objects that are looked at: all, or of many the best verified."""
+    """Indices of the objects that count, the best verified first, at most ``MAX_OBJECTS``."""
     return np.argsort(-observation.objects.verification, kind="stable")[:MAX_OBJECTS]
 
 
-def gather_patches(points: np.ndarray, diameter: float) -> np.ndarray:
-    """The densest balls of unexplained points, one after the other.
+def cluster_unexplained(points: np.ndarray, diameter: float) -> np.ndarray:
+    """Clusters of unexplained surface: the densest balls of points, one after the other, without those of earlier ones.
 
     Args:
         points: (k, 3) metres.
         diameter: of an object.
 
     Returns:
-        (m, 3) middles of the patches.
+        (m, 3) means of the clusters' points, metres.
     """
     thinning = max(1, -(-len(points) // _MOST_POINTS))
     points = points[::thinning]
-    near = cdist(points, points) < _PATCH_RADIUS * diameter
+    near = cdist(points, points) < _CLUSTER_RADIUS * diameter
     middles: list[np.ndarray] = []
     free = np.ones(len(points), bool)
-    while len(middles) < MAX_PATCHES and free.any():
+    while len(middles) < MAX_CLUSTERS and free.any():
         count = near @ free.astype(np.float32) * free
         members = near[count.argmax()] & free
         if members.sum() * thinning < _FEWEST_POINTS:
@@ -149,42 +153,42 @@ def gather_patches(points: np.ndarray, diameter: float) -> np.ndarray:
     return np.reshape(middles, (-1, 3))
 
 
-def guess_middle(points: np.ndarray, patch: np.ndarray, model: ObjectModel) -> np.ndarray:
-    """Where the middle of an object is likely to be, given surface of it.
+def likely_centre(points: np.ndarray, cluster: np.ndarray, model: ObjectModel) -> np.ndarray:
+    """(3,) likely centre of the object that a cluster of unexplained surface belongs to (a soft Hough transform).
 
-    Every point about the patch votes for the places that are as far from it as an object's surface mostly is from its
-    middle; the answer is the mean of all places, weighted by how many agree on them (a Hough transform, softened).
+    Every point near the cluster votes for candidates at the median distance of the object's surface from its centre.
+    The result is the mean of all candidates, weighted by their votes.
 
     Args:
         points: (k, 3) unexplained surface, metres.
-        patch: (3,) middle of some of it.
+        cluster: (3,) mean of the cluster, metres.
         model: of the object.
     """
-    near = points[np.linalg.norm(points - patch, axis=1) < _VOTERS_WITHIN * model.diameter]
+    near = points[np.linalg.norm(points - cluster, axis=1) < _VOTERS_WITHIN * model.diameter]
     near = near[:: max(1, -(-len(near) // _MOST_VOTERS))]
-    places = patch + _PLACES * model.diameter
-    off_surface = (cdist(places, near) - _middle_radius(model)) / (_SHELL * model.diameter)
+    centres = cluster + _CENTRES * model.diameter
+    off_surface = (cdist(centres, near) - _surface_radius(model)) / (_SHELL * model.diameter)
     votes = np.exp(-0.5 * off_surface**2).mean(axis=1)
     weight = np.exp(_SHARPNESS * (votes - votes.max()))
-    return weight @ places / weight.sum()
+    return weight @ centres / weight.sum()
 
 
 @lru_cache(maxsize=16)
-def _middle_radius(model: ObjectModel) -> float:
-    """How far half of an object's surface is from its origin, metres."""
+def _surface_radius(model: ObjectModel) -> float:
+    """Median distance of an object's surface from its origin, metres."""
     return float(np.median(np.linalg.norm(model_views(model).points, axis=1)))
 
 
 def represent(observation: Observation, model: ObjectModel, tray: Tray | None = None) -> SceneState:
-    """Everything that the network is told of an observation of objects in a tray, the usual one when None."""
+    """Network input features of an observation; ``tray`` is the bin, the object's usual one when None."""
     objects, t = observation.objects, len(observation.positions)
     best = best_verified(observation)
     unexplained = observation.unexplained
-    patches = gather_patches(unexplained, model.diameter)
-    n, m = len(best), len(patches)
+    clusters = cluster_unexplained(unexplained, model.diameter)
+    n, m = len(best), len(clusters)
     T_world_item = np.tile(np.eye(4), (n + m, 1, 1))
     T_world_item[:n] = objects.T_world_object[best]
-    T_world_item[n:, :3, 3] = np.reshape([guess_middle(unexplained, patch, model) for patch in patches], (m, 3))
+    T_world_item[n:, :3, 3] = np.reshape([likely_centre(unexplained, cluster, model) for cluster in clusters], (m, 3))
     grid = observation.sphere.positions
     eyes = np.concatenate([grid, observation.positions])
     shares = expected_visibility(model).shares(T_world_item, eyes, tray or Tray.for_model(model), hiding=n)
@@ -195,7 +199,7 @@ def represent(observation: Observation, model: ObjectModel, tray: Tray | None = 
     scalars[:n, :4] = np.column_stack(columns)[best]
     scalars[n:, 4] = 1.0
     apart = cdist(T_world_item[:, :3, 3], unexplained)
-    for column, within in enumerate(_NEAR_MIDDLE, start=5):
+    for column, within in enumerate(_NEAR_CENTRE, start=5):
         scalars[:, column] = (apart < within * model.diameter).sum(axis=1) / _POINTS_OF_ONE
     return SceneState(
         pose,
@@ -214,16 +218,16 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
     """Padded tensors of B states of one object and one grid.
 
     Args:
-        states: of any numbers of items and of views taken.
-        views: (M,) those in question, all of the grid when None.
+        states: with any numbers of items and of views taken.
+        views: (M,) indices of the views to describe, all of the grid when None.
 
     Returns:
-        ``items`` (B, n, 18) and ``outlooks`` (B, M, 8) of the states; ``present`` (B, n), which items are no padding;
-        ``more`` (B,), whether moves are left after the next; ``pairs`` (B, M, n, 12) what is known of each item and
-        each view: the share that the view would show, how much that is above what was seen, how steeply the view
-        looks down on the item, the angle to the nearest view taken, its cosine, how much the views taken have seen from
-        that side, how far away the item is, whether the view is on the item's side of the bin, how far off the image's
-        centre the item is, and the direction to the view in the object's frame.
+        ``items`` (B, n, 18) and ``outlooks`` (B, M, 8) of the states. ``present`` (B, n), which items are no padding.
+        ``more`` (B,), whether moves are left after the next. ``pairs`` (B, M, n, 12), features of each item and view:
+        the share of the item that the view would show; how much more that is than the views taken have shown; how
+        steeply the view looks down on the item; the angle to the nearest view taken, seen from the item, and its
+        cosine; how much the views taken have seen from that side; the distance; whether the view is on the item's side
+        of the bin; how far the item is from the image's centre; and the direction to the view in the object's frame.
     """
     count = max(1, *(len(each.pose) for each in states))
     some = slice(None) if views is None else views
@@ -257,7 +261,7 @@ def _sides(directions: np.ndarray, axis: np.ndarray) -> np.ndarray:
 def _pair(
     pose: np.ndarray, shown: np.ndarray, seen: np.ndarray, taken: np.ndarray, views: np.ndarray, pairs: np.ndarray
 ) -> None:
-    """Fill one state's ``pairs`` of :func:`gather`; compiled, since it is a dozen numbers each."""
+    """Fill one state's ``pairs`` of :func:`gather`; compiled, because it loops over all items and views."""
     to_taken = np.empty(taken.shape, np.float32)
     radius = _length(taken[-1, 0], taken[-1, 1], taken[-1, 2])
     for item in range(len(pose)):
@@ -282,7 +286,7 @@ def _pair(
             off_axis /= _length(views[view, 0], views[view, 1], views[view, 2])
             pair = pairs[view, item]
             pair[0], pair[1], pair[2] = shown[item, view], shown[item, view] - most, z
-            # Just off the ends, where the angle has no derivative.
+            # Not quite 1 and -1, where the arc cosine has no derivative.
             pair[3] = np.arccos(closest * np.float32(0.999999)) / np.float32(np.pi)
             pair[4], pair[5], pair[6] = closest, known / np.float32(2), distance - np.float32(1)
             pair[7], pair[8] = (x0 * x + y0 * y) / from_axis, off_axis - np.float32(0.95)
@@ -292,5 +296,5 @@ def _pair(
 
 @compiled
 def _length(x: np.float32, y: np.float32, z: np.float32) -> np.float32:
-    """Of a vector in metres, a micrometre at the least: nothing has the direction of a zero."""
+    """Length of a vector in metres, at least a micrometre, so that one can divide by it."""
     return max(np.sqrt(x * x + y * y + z * z), np.float32(1e-6))

@@ -1,12 +1,11 @@
 """A policy that scores every view against the set of all objects: ``view-attention`` in the registry.
 
-A Gaussian over two angles cannot say "either of these two gaps". Here every view of the grid is valued by itself:
-it looks at all accumulated objects (cross-attention), and at the surface that none of them explains, through what a
-robot knows of each pair: how much of the object the view would show past the others and the bin's walls, from which
-side of the object it comes, how new that side is after the views already taken. The order and the number of objects do
-not matter.
+A Gaussian over two angles has one peak; good views may be on both sides of the bin. So every view of the grid is
+valued separately. It attends to all accumulated objects and to the clusters of unexplained surface (cross-attention).
+Features of each pair say how much of the object the view would show past the others and the bin's walls, from which
+side, and how new that side is. The order and the number of objects do not matter.
 
-The network predicts what a view gains at once and what can still be gained after it. Training is in
+The network predicts the gain of a view and the gain of the moves after it. Training is in
 :mod:`active6d_agent.policies.view_attention.dagger`.
 """
 
@@ -38,18 +37,18 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.expected_visibility import Tray
 
-#: Gains are told as objects newly detected, and as the fall of the summed e_ADD over 50 mm.
+#: A gain is the number of objects newly detected, and the fall of the summed e_ADD over 50 mm.
 GAINS = 2
 
 
 @dataclass(frozen=True)
 class Weighing:
-    """What counts.
+    """Weights of gains and travel in the worth of a view.
 
     Attributes:
-        metres_weight: objects that must be gained for a metre on the way.
-        error_weight: of the fall of the summed error over 50 mm, against one object detected.
-        lookahead: in [0, 1], weight of what the moves after the next will gain.
+        metres_weight: objects that one metre of travel costs.
+        error_weight: of the fall of the summed e_ADD over 50 mm, in objects detected.
+        lookahead: in [0, 1], weight of the gain of the moves after the next.
 
     Raises:
         ValueError: a weight is out of range.
@@ -68,18 +67,18 @@ class Weighing:
 
 
 class _Seen(NamedTuple):
-    """What (M) views make of (n) objects."""
+    """Activations of (M) views and (n) items."""
 
     pairs: torch.Tensor
-    """(B, M, n, hidden), also of objects that are padding"""
+    """(B, M, n, hidden), padding included"""
     total: torch.Tensor
-    """(B, M, hidden) sum over the objects"""
+    """(B, M, hidden) sum over the items"""
     whole: torch.Tensor
-    """(B, M, 3 hidden + 8) the attended, the mean, and what is known of the view"""
+    """(B, M, 3 hidden + 8) the attended, the mean, and the features of the view"""
     attention: torch.Tensor
     """(B, M, n)"""
     mask: torch.Tensor
-    """(B, n) 1 for an object, 0 for padding"""
+    """(B, n) 1 for an item, 0 for padding"""
 
 
 class ViewAttention(nn.Module):
@@ -87,7 +86,7 @@ class ViewAttention(nn.Module):
 
     Args:
         hidden: width.
-        weighing: what counted when it was validated.
+        weighing: with which it was validated.
     """
 
     def __init__(self, hidden: int = 32, weighing: Weighing = Weighing()) -> None:
@@ -116,15 +115,18 @@ class ViewAttention(nn.Module):
             (B, M, n) each view's attention to the objects.
         """
         seen = self._look(state)
-        # Gains of different objects add up, each a linear function of its features, so they are had from the sum of
-        # those. What nobody has seen yet is for the view as a whole to say.
+        # Gains of items add up, each a linear function of its features, so the sum of the features suffices. Gains of
+        # objects without an item come from the view as a whole.
         bias = (seen.mask.sum(dim=1, keepdim=True) * self.per_object.bias)[:, None]
         gains = seen.total @ self.per_object.weight.T + bias + self.per_view(seen.whole)
         return gains[..., :GAINS], gains[..., GAINS:] * state["more"][:, None, None], seen.attention
 
     def explain(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """What :meth:`forward` adds up, to learn from: twice (B, M, n + 1, 2), gains of going there next and of the
-        moves after that, of each object, and at the end of the view as a whole."""
+        """The terms that :meth:`forward` sums, for training.
+
+        Twice (B, M, n + 1, 2): gains of going there next and of the moves after that, of each item, and last of the
+        view as a whole.
+        """
         seen = self._look(state)
         own = self.per_object(seen.pairs) * seen.mask[:, None, :, None]
         gains = torch.cat([own, self.per_view(seen.whole)[:, :, None]], dim=2)
@@ -137,7 +139,7 @@ class ViewAttention(nn.Module):
         count = mask.sum(dim=1, keepdim=True).clamp(min=1)
         pooled = (h * mask[..., None]).sum(dim=1) / count
         h = self.in_context(torch.cat([h, pooled[:, None].expand_as(h)], dim=-1))
-        # Passes over (B, M, n, hidden) are what costs: sums are in place, and masks in the weights of sums.
+        # Passes over (B, M, n, hidden) dominate the time: sums are in place, and masks are in the weights of sums.
         e = self.of_pair(state["pairs"])
         e += self.pair_from_object(h)[:, None]
         e += self.pair_from_view(views)[:, :, None]
@@ -176,9 +178,9 @@ class ViewValues:
     """Of B observations.
 
     Attributes:
-        worth: (B, M) of going to each view next, ``-inf`` where it is no candidate.
+        worth: (B, M) of going to each view next, ``-inf`` where it is not a candidate.
         gain: (B, M) expected of it and all later moves, ``-inf`` likewise.
-        attention: (B, M, n) of each view to the objects and patches.
+        attention: (B, M, n) of each view to the objects and clusters of unexplained surface.
     """
 
     worth: np.ndarray
@@ -210,7 +212,7 @@ def trace(network: ViewAttention, model: ObjectModel) -> nn.Module:
         # torch calls tracing deprecated, but what shall replace it needs a compiler on the robot.
         warnings.simplefilter("ignore", DeprecationWarning)
         traced = torch.jit.trace(network, (state,), strict=False, check_trace=False)
-        # The first two calls optimise it; no decision should wait for that.
+        # The first two calls optimise it, which no decision should wait for.
         for _ in range(2):
             traced(state)
     return traced
@@ -238,13 +240,12 @@ def _one_thread() -> Iterator[None]:
 
 @register_policy("view-attention")
 class ViewAttentionPolicy:
-    """Goes to the view that is worth most: what it gains at once, plus what the moves after it are expected to gain,
-    less the way there.
+    """Goes to the view of highest worth: its expected gain, plus that of the moves after it, less the travel.
 
     Args:
         model: names the shipped weights.
         weights: path of other weights, ``""`` for the shipped ones.
-        metres_weight: see :class:`Weighing`; by default what the weights were validated with, as the next two.
+        metres_weight: see :class:`Weighing`; by default that of the weights, as for the next two.
         error_weight: likewise.
         lookahead: likewise.
         stop_below: stop when this and all later moves are expected to gain less than this many objects; 0 never does.
@@ -283,7 +284,7 @@ class ViewAttentionPolicy:
         """Nothing is random here."""
 
     def decide(self, observation: Observation) -> Decision:
-        """The view of most worth, and the object that it attends to."""
+        """The view of highest worth, and the object that it attends to."""
         with _one_thread():
             state = represent(observation, self._model, self._tray)
             values = value_views(self._network, [observation], [state], self._weighing)
@@ -294,6 +295,6 @@ class ViewAttentionPolicy:
         attention = np.zeros(len(observation.objects))
         best = best_verified(observation)
         attention[best] = values.attention[0, view, : len(best)]
-        if not attention.any():  # all of it is on surface that no object explains
+        if not attention.any():  # all of it is on unexplained surface
             return Decision.go_to(observation, view)
         return Decision.go_to(observation, view, attention / attention.sum(), int(attention.argmax()))
