@@ -22,7 +22,7 @@ def test_this_machine_is_well(tmp_path):
     for name in ("two nodes exchange a message", "ray casting a view", "writing and reading a bag"):
         assert checks[name]["ok"], checks[name]
         assert checks[name]["needed"]
-    assert all(check["mend"] for check in checks.values() if not check["ok"])
+    assert all(check["fix"] for check in checks.values() if not check["ok"])
     assert "The core path works." in result.stdout
 
 
@@ -38,11 +38,11 @@ def test_a_missing_needed_library_is_exit_code_1(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(("needed", "expected"), [(True, False), (False, True)])
 def test_only_what_is_needed_counts(needed, expected):
-    assert works([Check("A", "a", True, True, ""), Check("A", "b", False, needed, "", "mend")]) is expected
+    assert works([Check("A", "a", True, True, ""), Check("A", "b", False, needed, "", "fix")]) is expected
 
 
 def test_a_library_that_breaks_while_loading_is_a_finding(tmp_path, monkeypatch):
     (tmp_path / "brittle_library.py").write_text("raise OSError('libusb-1.0.so.0: cannot open\\nmore')\n")
     monkeypatch.syspath_prepend(tmp_path)
-    check = doctor._import_check("A", "brittle_library", "brittle", needed=True, mend="mend it")
-    assert (check.ok, check.detail, check.mend) == (False, "libusb-1.0.so.0: cannot open", "mend it")
+    check = doctor._import_check("A", "brittle_library", "brittle", needed=True, fix="fix it")
+    assert (check.ok, check.detail, check.fix) == (False, "libusb-1.0.so.0: cannot open", "fix it")

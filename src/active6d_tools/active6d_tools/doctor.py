@@ -1,4 +1,4 @@
-"""What this machine has of what active6d needs, what is missing, and how to mend it."""
+"""What this machine has of what active6d needs, what is missing, and how to fix it."""
 
 import ctypes.util
 import importlib
@@ -27,7 +27,7 @@ class Check:
         ok: whether it is there and works.
         needed: whether the core path (simulate, estimate, fuse, move, record, report) needs it.
         detail: version or finding, one line.
-        mend: how to get it, empty when ``ok``.
+        fix: how to get it, empty when ``ok``.
     """
 
     group: str
@@ -35,7 +35,7 @@ class Check:
     ok: bool
     needed: bool
     detail: str
-    mend: str = ""
+    fix: str = ""
 
 
 def examine() -> Iterator[Check]:
@@ -70,8 +70,8 @@ def _libraries() -> Iterator[Check]:
     }
     for file, package in system.items():
         found = ctypes.util.find_library(file)
-        mend = "" if found else f"apt install {package} (as root); Open3D loads it"
-        yield Check("System libraries", f"lib{file}", bool(found), False, found or "not found", mend)
+        fix = "" if found else f"apt install {package} (as root); Open3D loads it"
+        yield Check("System libraries", f"lib{file}", bool(found), False, found or "not found", fix)
     needed = {
         "numba": "numba",
         "numpy": "numpy",
@@ -84,7 +84,7 @@ def _libraries() -> Iterator[Check]:
         "PIL": "pillow",
     }
     for module, distribution in needed.items():
-        yield _import_check("Python libraries", module, distribution, needed=True, mend=PIP)
+        yield _import_check("Python libraries", module, distribution, needed=True, fix=PIP)
     optional = {
         # The wrapper, since pybullet itself prints a banner.
         "active6d_sim.physics.bullet": ("pybullet", "new heaps in the simulator; a robot needs none"),
@@ -95,15 +95,15 @@ def _libraries() -> Iterator[Check]:
         "mcap": ("mcap", "a second reader of bags, for the tests; in requirements-dev.txt"),
     }
     for module, (distribution, purpose) in optional.items():
-        yield _import_check("Python libraries", module, distribution, needed=False, mend=f"{PIP} ({purpose})")
+        yield _import_check("Python libraries", module, distribution, needed=False, fix=f"{PIP} ({purpose})")
 
 
-def _import_check(group: str, module: str, distribution: str, *, needed: bool, mend: str) -> Check:
+def _import_check(group: str, module: str, distribution: str, *, needed: bool, fix: str) -> Check:
     try:
         imported = importlib.import_module(module)
     except Exception as error:  # a broken native library raises more than ImportError, and that is what we look for
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        return Check(group, distribution, False, needed, reason, mend)
+        return Check(group, distribution, False, needed, reason, fix)
     try:
         version = importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
@@ -113,7 +113,7 @@ def _import_check(group: str, module: str, distribution: str, *, needed: bool, m
 
 def _ros() -> Iterator[Check]:
     pip_ros = f"{PIP}, or source /opt/ros/jazzy/setup.bash where ROS 2 Jazzy is installed"
-    yield _import_check("ROS 2", "rclpy", "rclpy", needed=True, mend=pip_ros)
+    yield _import_check("ROS 2", "rclpy", "rclpy", needed=True, fix=pip_ros)
     try:
         from rclpy.utilities import get_rmw_implementation_identifier
 
@@ -138,18 +138,18 @@ def _ros() -> Iterator[Check]:
         "lifecycle_msgs",
     ):
         module = f"{package}.{'srv' if package == 'std_srvs' else 'msg'}"
-        yield _import_check("ROS 2", module, package, needed=True, mend=pip_ros)
+        yield _import_check("ROS 2", module, package, needed=True, fix=pip_ros)
     for module, purpose in (
         ("vision_msgs", "Detection3DArray output"),
         ("tf2_msgs", "/tf output"),
         ("launch_ros", "launch files"),
     ):
-        mend = f"{APT_ROS}{module.replace('_', '-')} ({purpose})"
-        yield _import_check("ROS 2, optional", module, module, needed=False, mend=mend)
+        fix = f"{APT_ROS}{module.replace('_', '-')} ({purpose})"
+        yield _import_check("ROS 2, optional", module, module, needed=False, fix=fix)
     for program, package in (("ros2", "ros-jazzy-ros2cli"), ("colcon", "python3-colcon-common-extensions")):
         path = shutil.which(program) or shutil.which(str(Path(sys.executable).parent / program))
-        mend = "" if path else f"apt install {package} (to run the nodes one by one, or to build the workspace)"
-        yield Check("ROS 2, optional", program, bool(path), False, path or "not found", mend)
+        fix = "" if path else f"apt install {package} (to run the nodes one by one, or to build the workspace)"
+        yield Check("ROS 2, optional", program, bool(path), False, path or "not found", fix)
 
 
 def _project() -> Iterator[Check]:
@@ -162,9 +162,9 @@ def _project() -> Iterator[Check]:
         "active6d_tools",
     ):
         needed = package != "active6d_sim"  # a robot has its own camera
-        yield _import_check("active6d", package, package, needed=needed, mend="pip install -e src/" + package)
-    mend = "mend the description it names, or ACTIVE6D_OBJECT_PATH, which adds folders"
-    yield _attempt("active6d", "object models", _load_objects, mend)
+        yield _import_check("active6d", package, package, needed=needed, fix="pip install -e src/" + package)
+    fix = "fix the description it names, or ACTIVE6D_OBJECT_PATH, which adds folders"
+    yield _attempt("active6d", "object models", _load_objects, fix)
     yield _weights()
 
 
@@ -172,8 +172,8 @@ def _weights() -> Check:
     spec = importlib.util.find_spec("active6d_perception")
     folder = Path(spec.origin).parent / "estimators/dense/weights" if spec and spec.origin else Path("weights")
     found = sorted(path.stem for path in folder.glob("*.safetensors"))
-    mend = "" if found else "active6d works without (the geometric estimator needs none)"
-    return Check("active6d", "estimator weights", bool(found), False, ", ".join(found) or f"none in {folder}", mend)
+    fix = "" if found else "active6d works without (the geometric estimator needs none)"
+    return Check("active6d", "estimator weights", bool(found), False, ", ".join(found) or f"none in {folder}", fix)
 
 
 def _self_tests() -> Iterator[Check]:
@@ -183,12 +183,12 @@ def _self_tests() -> Iterator[Check]:
     yield _attempt("Self test", "writing and reading a bag", _write_bag, PIP)
 
 
-def _attempt(group: str, name: str, action: Callable[[], str], mend: str) -> Check:
+def _attempt(group: str, name: str, action: Callable[[], str], fix: str) -> Check:
     try:
         return Check(group, name, True, True, action())
     except Exception as error:  # whatever goes wrong is the finding
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        return Check(group, name, False, True, reason, mend)
+        return Check(group, name, False, True, reason, fix)
 
 
 def _load_objects() -> str:

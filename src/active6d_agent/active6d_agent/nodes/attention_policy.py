@@ -6,7 +6,6 @@ import numpy as np
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
-from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
 from active6d_agent.policies.episode_state import EpisodeState, Limits
@@ -72,7 +71,7 @@ class AttentionPolicyNode(GraphNode):
         self._views = ViewInputs(self, ["pose"], self._on_view, _OTHERS)
         self.input(DiagnosticArray, "episode/start", self._on_start, latched=True)
         self.input(DiagnosticArray, "view_goal/status", self._on_status, latched=True)
-        self._timer: Timer | None = None
+        self._timer = None
         self._forget()
 
     def setup(self) -> None:

@@ -191,12 +191,13 @@ class GraphNode(ParameterNode):
         if not self._active:
             self._watch.update(None)
             state = "inactive" if self._configured else "unconfigured"
-            self._diagnose(DiagnosticStatus.OK, f"{state}, waiting for a lifecycle transition", now, {})
+            text = f"{state}, waiting for a lifecycle transition"
+            self._diagnose(DiagnosticStatus.OK, text, now, {"state": state})
             return
         awaited = self.awaited()
         seconds, cause = self._watch.update(awaited), self._watch.cause()
         if awaited is None:
-            self._diagnose(DiagnosticStatus.OK, "ready", now, {})
+            self._diagnose(DiagnosticStatus.OK, "ready", now, {"state": "ready"})
             return
         text = f"waiting for {awaited} for {seconds:.0f} s"
         if cause:
@@ -205,7 +206,7 @@ class GraphNode(ParameterNode):
                 self.get_logger().warning(text)
         self._last_cause = cause
         topics = ",".join(self.resolve_topic_name(topic) for topic in awaited.topics)
-        values = {"waiting_for": topics, "waiting_s": f"{seconds:.0f}"}
+        values = {"state": "waiting", "waiting_for": topics, "waiting_s": f"{seconds:.0f}"}
         self._diagnose(DiagnosticStatus.WARN if cause else DiagnosticStatus.OK, text, now, values)
 
     def _diagnose(self, level: bytes, message: str, stamp: int, values: dict[str, str]) -> None:

@@ -1,0 +1,158 @@
+"""Looks at a running graph: silent topics, incompatible QoS, and which node waits for which."""
+
+import os
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+
+from active6d_bringup.bags.writer import CONTRACT
+from active6d_core.ros.conversions import HARDWARE_ID
+from active6d_tools.doctor import Check
+
+_NAME = "active6d_doctor"
+_DIAGNOSTICS = "/diagnostics"
+#: From what the least demanding publisher offers to the most.
+_RELIABILITIES = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+_DURABILITIES = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
+
+
+def examine_graph(domain: int | None = None, namespace: str = "", seconds: float = 4.0) -> Iterator[Check]:
+    """Listen to a running graph for some seconds, then report on its nodes and topics.
+
+    Args:
+        domain: ROS domain, None for ``ROS_DOMAIN_ID`` or 0.
+        namespace: of the graph's nodes and topics.
+        seconds: how long to listen; nodes send a heartbeat every second.
+    """
+    domain = int(os.environ.get("ROS_DOMAIN_ID") or 0) if domain is None else domain
+    context = Context()
+    context.init(args=[], domain_id=domain)
+    executor = SingleThreadedExecutor(context=context)
+    listener = _Listener(context, namespace)
+    executor.add_node(listener)
+    try:
+        _spin(executor, seconds / 3)
+        listener.subscribe()
+        _spin(executor, seconds * 2 / 3)
+        where = f"in domain {domain}, namespace /{namespace.strip('/')}"
+        yield from _check_nodes(listener, where)
+        yield from _check_topics(listener, seconds)
+    finally:
+        executor.shutdown()
+        listener.destroy_node()
+        context.try_shutdown()
+
+
+def _spin(executor: SingleThreadedExecutor, seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.1)
+
+
+class _Listener(Node):
+    """Counts messages per topic of the contract and keeps each node's last heartbeat."""
+
+    def __init__(self, context: Context, namespace: str) -> None:
+        super().__init__(
+            _NAME, context=context, namespace=namespace, start_parameter_services=False, enable_rosout=False
+        )
+        self.topics = {topic.name: self.resolve_topic_name(topic.name) for topic in CONTRACT}
+        self.received: dict[str, int] = defaultdict(int)
+        self.heartbeats: dict[str, DiagnosticStatus] = {}
+        self.latched = {topic.name for topic in CONTRACT if topic.latched}
+        self.create_subscription(DiagnosticArray, _DIAGNOSTICS, self._on_diagnostics, 100)
+
+    def subscribe(self) -> None:
+        """Subscribe to what has been discovered, with QoS that its publishers match: others would log a warning."""
+        for topic in CONTRACT:
+            offered = [end.qos_profile for end in self.publishers(self.topics[topic.name])]
+            if topic.name == _DIAGNOSTICS or not offered:
+                continue
+            package, _, name = topic.type.split("/")
+            qos = QoSProfile(
+                depth=1,
+                reliability=min((each.reliability for each in offered), key=_RELIABILITIES.index),
+                durability=min((each.durability for each in offered), key=_DURABILITIES.index),
+            )
+            message_type = getattr(import_module(f"{package}.msg"), name)
+            self.create_subscription(message_type, topic.name, partial(self._count, topic.name), qos, raw=True)
+
+    def publishers(self, topic: str) -> list[Any]:
+        """Endpoints that publish a topic, this node left out."""
+        return [end for end in self.get_publishers_info_by_topic(topic) if end.node_name != _NAME]
+
+    def subscribers(self, topic: str) -> list[Any]:
+        """Endpoints that subscribe to a topic, this node left out."""
+        return [end for end in self.get_subscriptions_info_by_topic(topic) if end.node_name != _NAME]
+
+    def _count(self, topic: str, payload: bytes) -> None:
+        self.received[topic] += 1
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            inside = status.name.startswith(self.get_namespace().rstrip("/") + "/")
+            if status.hardware_id == HARDWARE_ID and inside and "state" in _values(status):
+                self.heartbeats[status.name] = status
+
+
+def _check_nodes(listener: _Listener, where: str) -> Iterator[Check]:
+    if not listener.heartbeats:
+        fix = "start the graph, or name it with --domain and --namespace"
+        yield Check("Nodes", "heartbeats", False, True, f"no node publishes diagnostics {where}", fix)
+    for name, status in sorted(listener.heartbeats.items()):
+        detail = status.message
+        awaited = _values(status).get("waiting_for", "")
+        sources = {end.node_name for topic in awaited.split(",") if topic for end in listener.publishers(topic)}
+        if sources:
+            detail += f" (published by {', '.join(sorted(sources))})"
+        warned = status.level != DiagnosticStatus.OK
+        yield Check("Nodes", name, not warned, warned, detail, "see the topics below" if warned else "")
+
+
+def _check_topics(listener: _Listener, seconds: float) -> Iterator[Check]:
+    for name, topic in listener.topics.items():
+        publishers, subscribers = listener.publishers(topic), listener.subscribers(topic)
+        who = _names(subscribers)
+        if not publishers:
+            if subscribers:
+                fix = f"start the node that publishes {topic}, or check remaps, namespace and domain"
+                yield Check("Topics", topic, False, False, f"nobody publishes it; subscribed by {who}", fix)
+            continue
+        mismatches = list(_mismatches(publishers, subscribers))
+        if mismatches:
+            fix = "camera topics: set latched_camera:=false on the nodes; else see qos_overrides in docs/graph.md"
+            yield Check("Topics", topic, False, True, "; ".join(mismatches), fix)
+        elif name != _DIAGNOSTICS and not listener.received[name]:
+            # Topics that are not transient local are silent whenever nothing is decided.
+            silent = f"published by {_names(publishers)}, silent for {seconds:.0f} s"
+            fix = "see in the list of nodes what its publisher waits for" if name in listener.latched else ""
+            yield Check("Topics", topic, not fix, False, silent, fix)
+        else:
+            detail = f"published by {_names(publishers)}, subscribed by {who or 'nobody'}"
+            yield Check("Topics", topic, True, False, detail)
+
+
+def _mismatches(publishers: list[Any], subscribers: list[Any]) -> Iterator[str]:
+    for publisher in publishers:
+        for subscriber in subscribers:
+            compatibility, reason = qos_check_compatible(publisher.qos_profile, subscriber.qos_profile)
+            if compatibility == QoSCompatibility.ERROR:
+                reason = reason.strip().rstrip(";").removeprefix("ERROR: ")
+                yield f"{publisher.node_name} does not reach {subscriber.node_name}: {reason}"
+
+
+def _names(endpoints: list[Any]) -> str:
+    return ", ".join(sorted({end.node_name for end in endpoints}))
+
+
+def _values(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
