@@ -124,7 +124,7 @@ def test_page_says_the_numbers():
     assert "3 of 4" in page.text
     assert f"{charged(OFFSETS[-1]):.1f} mm" in page.text
     for offsets, found in zip(OFFSETS, (1, 3, 3), strict=True):
-        assert f"found {found} of 4 · e_ADD {charged(offsets):.1f} mm" in page.text
+        assert f"found {found} of 4 · ADD {charged(offsets):.1f} mm" in page.text
     assert "110.0 ms" in page.text
     assert "budget of 2 moves spent" in page.text
     assert "no such object" in page.text
@@ -151,7 +151,7 @@ def test_page_without_truth_objects_or_diagnostics():
     assert "the recording was cut off" in page.text
     assert "no diagnostics" in page.text
     assert "no object yet" in page.text
-    assert "e_ADD mm" not in page.text
+    assert "ADD mm" not in page.text
 
 
 def test_page_escapes_what_the_bag_says():

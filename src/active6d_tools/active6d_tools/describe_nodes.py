@@ -1,4 +1,4 @@
-"""Write what the nodes declare into the parameter file and the tables of docs/graph.md; the tests compare both.
+"""Write the declared parameters and topics of all nodes to the parameter file and to the tables of docs/graph.md.
 
 Run it after changing a parameter or a topic: `python -m active6d_tools.describe_nodes`
 """

@@ -1,4 +1,4 @@
-"""Pictures of the score study: equation 1 against the errors, and what is said of an unseen handle."""
+"""Plots of score quality: equation 1 against the errors, and the certainty of the rotation of hidden handles."""
 
 from pathlib import Path
 
@@ -7,15 +7,15 @@ import numpy as np
 from active6d_core.metrics import MISSED_E_ADD
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.single_view_evaluation import EstimatorResult
-from active6d_tools.benchmark.estimator_summary import FEATURE_SEEN, SAME_TURN, score_study, turns
+from active6d_tools.benchmark.estimator_summary import FEATURE_SEEN, SAME_TURN, axis_rotation_errors, score_study
 
 _RIGHT, _WRONG = "tab:green", "tab:red"
 
 
 def draw_verification(path: Path, title: str, result: EstimatorResult) -> None:
-    """Scatter of the verification score over e_ADD and over ADD-S (the paper's supplement A) as PNG.
+    """Scatter of the verification score over ADD and over ADD-S (the paper's supplement A) as PNG.
 
-    Errors above 50 mm, what a missed object costs, are drawn there.
+    Errors above 50 mm, the error of a missed object, are drawn at 50 mm.
 
     Raises:
         OSError: the file cannot be written.
@@ -25,7 +25,7 @@ def draw_verification(path: Path, title: str, result: EstimatorResult) -> None:
     study = score_study(result)
     score = result.gather("verification")
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-    for axes, (kind, label) in zip(figure.subplots(1, 2), (("add", "e_ADD"), ("adds", "ADD-S")), strict=True):
+    for axes, (kind, label) in zip(figure.subplots(1, 2), (("add", "ADD"), ("adds", "ADD-S")), strict=True):
         error = np.concatenate([view.least(kind) for view in result.views])
         for chosen, color, name in ((error < result.limit, _RIGHT, "right"), (error >= result.limit, _WRONG, "wrong")):
             axes.plot(
@@ -50,19 +50,19 @@ def draw_verification(path: Path, title: str, result: EstimatorResult) -> None:
 
 
 def draw_ambiguity(path: Path, title: str, model: ObjectModel, result: EstimatorResult) -> None:
-    """Certainty over the true rotation error as PNG, objects apart whose named part is seen and hidden.
+    """Certainty over the true rotation error as PNG, separately for objects with a visible and a hidden named part.
 
     Raises:
         OSError: the file cannot be written.
     """
     from matplotlib.figure import Figure
 
-    found = turns(result)
+    found = axis_rotation_errors(result)
     part = " or ".join(model.features)
     figure = Figure(figsize=(11.0, 6.0), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, height_ratios=(3, 1))
     names = (f"{part} seen (over {FEATURE_SEEN:.0%} of its surface)", f"{part} hidden")
-    label = "certainty of the turn" if found.told else "score"
+    label = "certainty of the axis rotation" if found.certain else "score"
     for (axes, histogram), name, chosen in zip(panels.T, names, (found.seen, ~found.seen), strict=True):
         right = chosen & (found.rotation < SAME_TURN)
         for group, color in ((right, _RIGHT), (chosen & ~right, _WRONG)):
@@ -75,7 +75,7 @@ def draw_ambiguity(path: Path, title: str, model: ObjectModel, result: Estimator
                 markersize=6,
                 markeredgewidth=0,
             )
-        share = f", {right.sum() / chosen.sum():.0%} turned right" if chosen.any() else ""
+        share = f", {right.sum() / chosen.sum():.0%} right" if chosen.any() else ""
         axes.set(ylabel=label, ylim=(0, 1.02), xlim=(0, 180))
         axes.set_title(f"{name}: {chosen.sum()} hypotheses{share}", fontsize="medium")
         histogram.hist(found.rotation[chosen], bins=np.arange(0, 181, 10), color="0.6")
@@ -87,7 +87,7 @@ def draw_ambiguity(path: Path, title: str, model: ObjectModel, result: Estimator
 
 
 def _alpha(count: int) -> float:
-    """Of a point among so many, such that crowds stay readable."""
+    """Opacity of one of ``count`` points."""
     return float(np.clip(300 / max(count, 1), 0.15, 0.8))
 
 

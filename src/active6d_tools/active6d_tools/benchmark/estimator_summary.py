@@ -1,4 +1,4 @@
-"""The table of one estimator: rates by visible fraction, BOP's measures, times, and the study of the scores."""
+"""Results of one estimator: detection rates by visible fraction, BOP's measures, times, and quality of the scores."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,16 +26,16 @@ VISIBLE = (0.5, 0.1)
 VISIBLE_BINS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 #: A named part (the mug's handle) is visible when more of its surface than this share is seen.
 FEATURE_SEEN = 0.15
-#: Views with so many objects at least a tenth visible are timed by themselves.
+#: Times are also given for the views with at least so many objects that are a tenth visible.
 CROWDED = 14
-#: Recall is told where the score is cut for this precision.
+#: Recall is given at the score thresholds with these precisions.
 PRECISIONS = (0.95, 0.98)
-#: A turn about the axis is right within this many degrees.
+#: A rotation about the axis is right within this many degrees.
 SAME_TURN = 30.0
 
 
 def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> dict[str, Any]:
-    """All that is said of one estimator, ready for JSON.
+    """All results of one estimator, for JSON.
 
     Args:
         model: the object.
@@ -43,8 +43,8 @@ def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> 
         scenes: (v,) which scene each view is of; intervals are by scenes.
 
     Returns:
-        ``precision`` and ``average_precision.pose`` count ADD-S for an object with a part that can hide (the mug's
-        handle), for a view may not tell its turn.
+        The results by name. For an object with a part that can be hidden (the mug's handle), ``precision`` and
+        ``average_precision.pose`` use ADD-S, because a view may not show the rotation about the axis.
     """
     by = "adds" if model.features else "add"
     row: dict[str, Any] = _detection(result, scenes)
@@ -75,7 +75,7 @@ def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> 
 
 
 def _detection(result: EstimatorResult, scenes: Sequence, feature_seen: float | None = None) -> dict[str, Any]:
-    """Rates found by e_ADD and ADD-S, of objects whose named part is visible if that is asked for."""
+    """Detection rates by ADD and ADD-S; only of objects with a visible named part if ``feature_seen`` is given."""
     per_view = np.repeat(np.arange(len(result.views)), [len(view.visible_fraction) for view in result.views])
     visible = result.gather("visible_fraction")
     counted = np.ones(len(visible), bool) if feature_seen is None else result.gather("feature_seen") > feature_seen
@@ -98,9 +98,9 @@ def _detection(result: EstimatorResult, scenes: Sequence, feature_seen: float | 
 
 
 def _times(result: EstimatorResult) -> dict[str, Any]:
-    """Milliseconds by the clock of the whole estimator and of its stages, for all views and for the crowded ones.
+    """Milliseconds of wall clock of the estimator and of its stages, for all views and for the crowded ones.
 
-    ``cpu`` is what all threads worked: on a machine that others use, too, it is the one to compare.
+    ``cpu`` is the CPU time of all threads. It is the one to compare on a shared machine.
     """
     crowded = [view for view in result.views if (view.visible_fraction >= LEAST_VISIBLE).sum() >= CROWDED]
     times: dict[str, Any] = {}
@@ -123,7 +123,7 @@ def _spread(milliseconds: Sequence[float]) -> dict[str, float]:
 
 
 def score_study(result: EstimatorResult) -> dict[str, Any]:
-    """How well equation 1, and the estimator's own score beside it, tell right poses from wrong (supplement A)."""
+    """How well equation 1 and the estimator's own score separate right from wrong poses (supplement A)."""
     errors = {kind: np.concatenate([view.least(kind) for view in result.views]) for kind in ("add", "adds")}
     right = {kind: error < result.limit for kind, error in errors.items()}
     study: dict[str, Any] = {"hypotheses": len(right["adds"])}
@@ -138,23 +138,23 @@ def score_study(result: EstimatorResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class AxisRotationErrors:
-    """Hypotheses that are right by ADD-S, so that only their turn about the axis may be wrong.
+    """Hypotheses that are right by ADD-S, so that only their rotation about the axis may be wrong.
 
     Attributes:
         rotation: (h,) degrees between the orientation and the true one.
-        certainty: (h,) that the estimator tells, or its score where it tells none.
+        certainty: (h,) of the estimator, or its score if it reports no certainty.
         seen: (h,) bool, the named part is visible.
-        told: whether the estimator tells a certainty.
+        certain: whether the estimator reports a certainty.
     """
 
     rotation: np.ndarray
     certainty: np.ndarray
     seen: np.ndarray
-    told: bool
+    certain: bool
 
 
-def turns(result: EstimatorResult) -> AxisRotationErrors:
-    """Collect the turns of all views."""
+def axis_rotation_errors(result: EstimatorResult) -> AxisRotationErrors:
+    """Collect the errors of all views."""
     rotation, certainty, score, seen = [], [], [], []
     for view in result.views:
         for pair in np.flatnonzero(view.adds < result.limit):
@@ -164,16 +164,18 @@ def turns(result: EstimatorResult) -> AxisRotationErrors:
                 certainty.append(view.certainty[hypothesis])
                 score.append(view.score[hypothesis])
                 seen.append(view.feature_seen[view.object[pair]] > FEATURE_SEEN)
-    told = bool(np.isfinite(certainty).all()) and len(certainty) > 0
-    return AxisRotationErrors(np.array(rotation), np.array(certainty if told else score), np.array(seen, bool), told)
+    certain = bool(np.isfinite(certainty).all()) and len(certainty) > 0
+    return AxisRotationErrors(
+        np.array(rotation), np.array(certainty if certain else score), np.array(seen, bool), certain
+    )
 
 
 def ambiguity_study(result: EstimatorResult) -> dict[str, Any]:
-    """Whether the estimator knows when it cannot know the turn about the axis."""
-    found = turns(result)
+    """Whether the certainty is low where the rotation about the axis is wrong."""
+    found = axis_rotation_errors(result)
     right = found.rotation < SAME_TURN
     study: dict[str, Any] = {
-        "told_by": "certainty" if found.told else "score",
+        "told_by": "certainty" if found.certain else "score",
         "auc": area_under_curve(found.certainty, right) if len(right) else None,
         "spearman": rank_correlation(found.certainty, found.rotation),
     }

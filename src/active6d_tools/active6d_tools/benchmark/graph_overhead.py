@@ -1,8 +1,8 @@
-"""What the node graph costs over calling the core functions, and how fast verification and fusion are.
+"""Overhead of the node graph over direct calls of the core functions.
 
-The camera and the estimator are replaced by what they would say, computed beforehand: a heap of 18 mugs rendered at
-full size, and 20 hypotheses a view near the true poses. Neither ray casting nor estimation is in any of the times; all
-messages have their full size, and conversions, transport, callbacks, verification, fusion and policy are real.
+The outputs of camera and estimator are computed beforehand: full-size images of a pile of 18 mugs, and 20 hypotheses
+per view near the true poses. The times contain conversions, transport, callbacks, verification, fusion and policy, and
+no rendering or estimation.
 """
 
 import tempfile
@@ -41,31 +41,31 @@ OnProgress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class PreparedViews:
-    """Views of one heap and the hypotheses that stand in for an estimator's, by stamp."""
+    """Views of one pile, and the hypotheses that replace an estimator, by stamp."""
 
     model: ObjectModel
     views: list[View]
     hypotheses: dict[int, Hypotheses]
 
 
-#: What the estimator named "prepared" answers; set by :func:`measure_graph`.
+#: Results of the estimator named "prepared"; set by :func:`measure_graph`.
 _prepared: dict[int, Hypotheses] = {}
 
 
 @register_estimator("prepared")
 class PreparedEstimator:
-    """Answers by stamp, at once."""
+    """Returns prepared hypotheses without any computation."""
 
     def __init__(self, model: ObjectModel) -> None:
         self._model = model
 
     def estimate(self, view: View) -> Hypotheses:
-        """What was prepared for this view's stamp."""
+        """The prepared hypotheses of this view."""
         return _prepared[view.stamp]
 
 
 class PreparedCamera(GraphNode):
-    """Publishes the prepared views one after the other, whatever the goal, and notes when each goal came."""
+    """Publishes the next prepared view at every goal, and stores the time of the goal."""
 
     def __init__(self, views: list[View], **arguments: Any) -> None:
         super().__init__("camera_simulator", **arguments)
@@ -98,9 +98,9 @@ class PreparedCamera(GraphNode):
 def prepare_views(
     object_name: str, seed: int, count: int, hypotheses: int, *, objects: int | None = None
 ) -> PreparedViews:
-    """Render ``count`` random views of a heap, with ``hypotheses`` of them per view around the true poses.
+    """Render ``count`` random views of a pile, with ``hypotheses`` hypotheses per view near the true poses.
 
-    The heap has ``objects`` instances, by default nearly as many as the object's heaps may have.
+    The pile has ``objects`` instances, by default two fewer than the maximum of the object.
     """
     from active6d_sim.physics.heap import drop_heap
     from active6d_sim.rendering.renderer import SceneRenderer
@@ -123,7 +123,7 @@ def prepare_views(
 def _near_the_truth(
     T_camera_object: np.ndarray, instance: np.ndarray, depth: np.ndarray, count: int, rng: np.random.Generator
 ) -> Hypotheses:
-    """``count`` hypotheses a few millimetres and degrees off, dealt to the objects with the most visible pixels."""
+    """``count`` hypotheses of the objects with the most visible pixels, a few millimetres and degrees off."""
     pixels = np.bincount(instance[instance >= 0], minlength=len(T_camera_object))
     ranked = np.argsort(-pixels)[: np.count_nonzero(pixels)]
     label = np.arange(count) % len(ranked)
@@ -147,21 +147,21 @@ def measure_graph(
 ) -> dict[str, Any]:
     """Compare the composed graph with direct calls, view by view.
 
-    Times are medians of the repeats, view by view.
+    The time of each view is the median of the repetitions.
 
     Args:
-        object_name: what is in the bin.
-        seed: of heap, views and hypotheses.
-        views: of one episode; T = views - 1.
-        hypotheses: per view.
-        repeats: episodes of each kind.
-        on_progress: called with what is being done, and how much of it is done.
+        object_name: of the objects in the bin.
+        seed: of pile, views and hypotheses.
+        views: number of views of one episode; T = views - 1.
+        hypotheses: number per view.
+        repeats: number of episodes of each kind.
+        on_progress: called with a description, the number of steps done and the number of all steps.
 
     Returns:
-        ``overhead_ms``: mean over the views of graph minus direct, milliseconds a view, without a recorder;
-        ``overhead_recorded_ms``: the same with a recorder in the graph, which compresses and writes everything;
-        ``graph_ms``, ``recorded_ms``, ``direct_ms``: the times a view themselves; ``fusion_ms`` and ``fusion_hz``:
-        verification and fusion of the last view by direct call; ``image_bytes``: of one view's images.
+        ``overhead_ms``: graph minus direct in milliseconds per view, mean over the views, without a recorder;
+        ``overhead_recorded_ms``: the same with a recorder, which compresses and writes all messages;
+        ``graph_ms``, ``recorded_ms``, ``direct_ms``: the times per view; ``fusion_ms`` and ``fusion_hz``: verification
+        and fusion of the last view by direct call; ``image_bytes``: size of the images of one view.
     """
     on_progress("rendering views", 0, 1)
     prepared = prepare_views(object_name, seed, views, hypotheses)
@@ -189,7 +189,7 @@ def measure_graph(
 
 
 def _summary(times: dict[str, list[np.ndarray]]) -> dict[str, float]:
-    """Milliseconds a view by kind of episode, from the median of each view's repeats."""
+    """Milliseconds per view by kind of episode, from the median of the repetitions of each view."""
     per_view = {kind: 1e3 * np.median(samples, axis=0) for kind, samples in times.items()}
     return {
         "overhead_ms": float((per_view["graph"] - per_view["direct"]).mean()),
@@ -201,7 +201,7 @@ def _summary(times: dict[str, list[np.ndarray]]) -> dict[str, float]:
 
 
 def _direct(prepared: PreparedViews) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds per view of the core functions, and of those the part of verification and fusion."""
+    """Seconds per view of the core functions, and the part of verification and fusion."""
     from active6d_agent.policies.registry import Observation, create_policy
     from active6d_perception.scene.fusion import SceneFusion
     from active6d_perception.scene.observed_surface import ObservedSurface
@@ -229,7 +229,7 @@ def _direct(prepared: PreparedViews) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _through_graph(prepared: PreparedViews, bag: Path | None) -> np.ndarray:
-    """Seconds per view from the goal that asks for it to the goal (or the end) that follows it."""
+    """Seconds per view from its goal to the next goal or the end of the episode."""
     name = prepared.model.name
     nodes: dict[str, dict[str, Any]] = {
         "pose_estimator": {"object": name, "estimator": "prepared"},

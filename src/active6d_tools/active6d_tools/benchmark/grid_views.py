@@ -25,7 +25,7 @@ class GridViews:
         Args:
             model: the scenes' object.
             scenes: by index.
-            seed: of the sensor's noise and of the scenes' looks.
+            seed: of sensor noise and appearance.
         """
         self.model, self.scenes, self._seed = model, scenes, seed
         self._sphere = ViewSphere()
@@ -34,7 +34,7 @@ class GridViews:
         self._part = feature_surface(model, _FEATURE_SAMPLES)
 
     def capture(self, index: int, number: int, noise: float) -> LabelledView:
-        """View ``number`` of the grid of scene ``index``, with that factor on the sensor's noise."""
+        """View ``number`` of the grid of scene ``index``, with that factor on the sensor noise."""
         scene = self.scenes[index]
         T_world_camera = self._sphere.pose(self._sphere.positions[number])
         if self._simulator is None or self._simulator.scene is not scene:

@@ -1,9 +1,8 @@
-"""What else a user would pick: OpenCV's point pair features and Open3D's FPFH with RANSAC, made fit for clutter.
+"""Estimators to compare with: OpenCV's point pair features, and Open3D's FPFH with RANSAC.
 
-Both libraries align one model with one cloud. To find many instances among identical neighbours, each gets what its
-users would add: the bin and the table are set aside, candidates are taken from all over the scene, and a pose is
-accepted only where the depth image agrees with it. Background, check and masks are those of our own estimators, so
-that the comparison is about what proposes and refines poses.
+Both libraries align one model with one point cloud. Finding many instances needs more: the bin is removed, candidates
+are taken from the whole scene, and a pose is accepted only if the depth image agrees with it. These parts are those of
+our own estimators, so that the comparison is about proposing and refining poses.
 """
 
 from collections.abc import Callable
@@ -28,7 +27,7 @@ _FEWEST_POINTS = 50
 
 
 class DepthCheck:
-    """Accepts poses that the depth image agrees with: most of what is not hidden is measured, little looked through."""
+    """Accepts poses that agree with the depth image: most unoccluded surface is measured, little is seen through."""
 
     def __init__(self, model: ObjectModel, *, min_fit: float = 0.5, max_violated: float = 0.12) -> None:
         """

@@ -1,7 +1,7 @@
-"""How fast everything behind the estimator is: verification, fusion, attention and policy, by direct calls.
+"""Times of verification, fusion and policy by direct calls.
 
-Views of a heap are rendered beforehand, with hypotheses near the true poses in place of an estimator's. Times are
-medians over repeats unless they say otherwise.
+Views of a pile are rendered beforehand. Hypotheses near the true poses replace an estimator. Times are medians over
+repetitions unless stated otherwise.
 """
 
 import tempfile
@@ -27,20 +27,20 @@ from active6d_tools.benchmark.graph_overhead import PreparedViews, prepare_views
 
 VIEWS = 6
 OBJECTS = 15
-#: Hypotheses accumulated over all views, for the curve of costs.
+#: Numbers of hypotheses accumulated over all views, for times over hypotheses.
 COUNTS = (10, 20, 50, 100, 200, 500, 1000)
 OnProgress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class LastViewTimes:
-    """Seconds spent on the last view, repeat by repeat.
+    """Seconds spent on the last view in each repetition.
 
     Attributes:
         verification: (r,) of its hypotheses.
-        fusion: (r,) of them with all earlier ones, and of the surface that the view shows.
+        fusion: (r,) of fusion with the earlier ones and of the unexplained surface.
         policy: (r,) of the decision.
-        objects: that fusion made of all.
+        objects: number of fused objects.
     """
 
     verification: np.ndarray
@@ -58,19 +58,19 @@ def measure_pipeline(
     counts: Sequence[int] = COUNTS,
     on_progress: OnProgress = lambda what, done, total: None,
 ) -> dict[str, Any]:
-    """Time the last of six views of 15 objects, and how costs grow with the number of hypotheses.
+    """Time the last of six views of 15 objects, and the same for growing numbers of hypotheses.
 
     Args:
-        object_name: what is in the bin.
-        policy: who decides. Without trained weights of ``view-attention`` untrained ones are timed, which cost as much.
-        seed: of heap, views and hypotheses.
-        repeats: of every measurement; ten times as many of the last view, for the 99th percentile.
+        object_name: of the objects in the bin.
+        policy: to time. If ``view-attention`` has no trained weights, untrained ones are timed, which take as long.
+        seed: of pile, views and hypotheses.
+        repeats: of every measurement; ten times as many for the last view, for the 99th percentile.
         counts: numbers of accumulated hypotheses for the curve.
-        on_progress: called with what is being done, and how much of it is done.
+        on_progress: called with a description, the number of steps done and the number of all steps.
 
     Returns:
-        ``fusion_hz`` of verification and fusion, ``policy_ms_p99`` of the decision, ``hz_total`` of all, each with the
-        times behind it, and ``cost``: a row for each of ``counts``.
+        ``fusion_hz`` of verification and fusion, ``policy_ms_p99`` of the decision, ``hz_total`` of all, their times,
+        and ``cost`` with a row for each of ``counts``.
     """
     on_progress("rendering views", 0, 1)
     prepared = prepare_views(object_name, seed, VIEWS, OBJECTS, objects=OBJECTS)
@@ -78,7 +78,7 @@ def measure_pipeline(
     verifier, rng = Verifier(prepared.model), np.random.default_rng(seed)
     found = list(prepared.hypotheses.values())
     on_progress("last view", 0, 1)
-    # A 99th percentile needs hundreds of times, or it is one slow one.
+    # A 99th percentile of few times is the slowest one.
     times = time_last_view(prepared, found, verifier, decider, max(10 * repeats, 100))
     cost = []
     for done, count in enumerate(counts):
@@ -108,7 +108,7 @@ def _milliseconds(times: LastViewTimes) -> dict[str, float]:
 
 
 def _make_policy(name: str, model: ObjectModel) -> tuple[Policy, bool]:
-    """The policy, and whether its weights are trained ones."""
+    """The policy, and whether its weights are trained."""
     if name != "view-attention" or weights_path(name, model.name).is_file():
         return create_policy(name, model), True
     with tempfile.TemporaryDirectory() as folder:
@@ -120,14 +120,14 @@ def _make_policy(name: str, model: ObjectModel) -> tuple[Policy, bool]:
 def time_last_view(
     prepared: PreparedViews, found: list[Hypotheses], verifier: Verifier, policy: Policy, repeats: int
 ) -> LastViewTimes:
-    """Verify, fuse and decide on the last view, again and again, with the earlier ones known."""
+    """Verify, fuse and decide on the last view ``repeats`` times; the earlier views are fused before."""
     model, sphere = prepared.model, ViewSphere()
     fusion, surface = SceneFusion(model), ObservedSurface(model)
     *earlier, (last, hypotheses) = zip(prepared.views, found, strict=True)
     known = [(view, one, verifier.score(view.depth, view.camera, one)) for view, one in earlier]
     positions = np.array([view.T_world_camera[:3, 3] for view in prepared.views])
     policy.reset(np.random.default_rng(0))
-    # The first decision pays for what libraries set up lazily.
+    # The first repetition is slower, because libraries initialise lazily; it is left out.
     seconds = np.zeros((repeats + 1, 3))
     for row in seconds:
         fusion.reset()
@@ -150,7 +150,7 @@ def time_last_view(
 
 
 def resize(hypotheses: Hypotheses, count: int, rng: np.random.Generator) -> Hypotheses:
-    """``count`` hypotheses: of these in turn, each a few millimetres and degrees off."""
+    """``count`` copies of the hypotheses in turn, each shifted and rotated by a few millimetres and degrees."""
     index = np.arange(count) % len(hypotheses)
     turn = Rotation.from_rotvec(rng.normal(0.0, 0.03, (count, 3))).as_matrix()
     off = make_transform(turn, rng.normal(0.0, 0.002, (count, 3)))

@@ -1,4 +1,4 @@
-"""Results of single views in a file of JSON lines, so that a long benchmark goes on where it was stopped."""
+"""Results of single views in a JSON-lines file, so that an interrupted benchmark continues where it stopped."""
 
 import json
 from collections.abc import Hashable
@@ -15,16 +15,16 @@ _PLAIN = {"width", "seconds", "cpu_seconds", "stage_ms"}
 
 
 class Records:
-    """Results by key; kept in memory only without a path."""
+    """Results by key; only in memory if there is no path."""
 
     def __init__(self, path: Path | None, header: dict[str, Any]) -> None:
         """
         Args:
             path: read if it exists, and appended to.
-            header: what all results have in common; a file with another header is refused.
+            header: settings of all results; a file with another header is refused.
 
         Raises:
-            ValueError: the file is no such file, or of other measurements; the message names it.
+            ValueError: the file is damaged or has results of other settings; the message names it.
         """
         self._path = path
         self._results: dict[Hashable, ViewResult] = {}
@@ -59,12 +59,12 @@ class Records:
         try:
             first, *entries = [json.loads(line) for line in whole.splitlines()]
             if first != header:
-                raise ValueError(f"it is of {first}, this is {header}; choose another file")
+                raise ValueError(f"its settings are {first}, the current ones {header}; choose another file")
             for entry in entries:
                 self._results[tuple(entry["key"])] = _result(entry)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path}: cannot go on with these records ({error})") from error
-        if whole != text:  # whoever wrote the last line was stopped in the middle of it
+            raise ValueError(f"{path}: cannot continue with these records ({error})") from error
+        if whole != text:  # the last line is incomplete: writing was interrupted
             path.write_text(whole)
 
 

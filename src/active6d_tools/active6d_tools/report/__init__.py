@@ -1,1 +1,1 @@
-"""The report of a recorded episode: numbers, one self-contained HTML page, one picture."""
+"""Reports of recorded episodes: numbers, a self-contained HTML page, pictures; and plots of results."""

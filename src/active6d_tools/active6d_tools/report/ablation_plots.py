@@ -25,7 +25,7 @@ def ablation_panels(part: str, rows: list[dict]) -> list[Panel]:
         "noise-resampling": ("noise", "policy", "views chosen by"),
     }.get(part, (None, "variant", part))
     panels = []
-    for key, label in (("detection_rate", "detection rate"), ("e_add_mm", "e_ADD [mm]"), third):
+    for key, label in (("detection_rate", "detection rate"), ("e_add_mm", "ADD [mm]"), third):
         lines: dict[str, tuple] = {}
         for name in dict.fromkeys(row.get(line, label) for row in rows):
             own = [row for row in rows if row.get(line, label) == name]
@@ -41,7 +41,7 @@ def _trade_offs(rows: list[dict]) -> list[Panel]:
     panels = []
     for x, x_label, y, y_label, names in (
         ("distance_m", "d [m]", "detection_rate", "detection rate", _TRADE_OFFS),
-        ("distance_m", "d [m]", "e_add_mm", "e_ADD [mm]", _TRADE_OFFS),
+        ("distance_m", "d [m]", "e_add_mm", "ADD [mm]", _TRADE_OFFS),
         ("moves", "moves taken", "detection_rate", "detection rate", _TRADE_OFFS[1:]),
     ):
         lines = {}

@@ -1,4 +1,4 @@
-"""What an episode's record says, in numbers: scores against the truth where the bag has it, distances, times."""
+"""Numbers of a recorded episode: detection and errors if the bag has ground truth, distances, times."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from active6d_core.view_sphere import ViewSphere
 
 @dataclass(frozen=True)
 class ObjectRow:
-    """One accumulated object at one step; attention and error are None where nothing is known of them."""
+    """One accumulated object at one step; attention and error are None if they are unknown."""
 
     index: int
     verification: float
@@ -32,10 +32,10 @@ class StepAnalysis:
 
     Attributes:
         number: from 0, the view before the first move.
-        record: what the bag has of it.
-        objects: what was accumulated up to this view; empty where the bag has none.
+        record: the messages of this view in the bag.
+        objects: the fused objects after this view; empty if the bag has none.
         rows: one per object, in their order.
-        truth: the scene's score, None without ground truth.
+        truth: detection and errors of all true objects, None without ground truth.
         azimuth: degrees of the camera, in [0, 360).
         elevation: degrees of the camera above the horizon.
         moved_m: metres of arc since the last view.
@@ -54,18 +54,18 @@ class StepAnalysis:
 
     @property
     def hypothesis_count(self) -> int:
-        """Hypotheses that the estimator had for this view alone."""
+        """Number of hypotheses of the estimator in this view."""
         return len(self.record.hypotheses) if self.record.hypotheses is not None else 0
 
     @property
     def attended(self) -> ObjectRow | None:
-        """The object that the policy attended to, None where it attended to none."""
+        """The object that the policy attended to, or None."""
         return next((row for row in self.rows if row.attended), None)
 
 
 @dataclass(frozen=True)
 class NodeTime:
-    """How long a node worked on a view, in milliseconds, from its diagnostics."""
+    """Processing time of a node per view in milliseconds, from its diagnostics."""
 
     node: str
     views: int
@@ -78,7 +78,7 @@ class EpisodeAnalysis:
     """An episode in numbers.
 
     Attributes:
-        model: of the object that the heap is made of.
+        model: of the objects in the bin.
         record: the episode itself.
         sphere: the hemisphere that the camera moved on.
         steps: one per view, in order.
@@ -98,7 +98,7 @@ class EpisodeAnalysis:
 
     @property
     def threshold_mm(self) -> float:
-        """An object is detected below this e_ADD."""
+        """An object is detected below this ADD."""
         return 1e3 * DETECTION_FRACTION * self.model.diameter
 
     def summary(self) -> dict:
@@ -135,19 +135,19 @@ def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAna
     """Score and measure a recorded episode.
 
     Args:
-        record: the episode; ``record.ground_truth`` may be missing, and every step's messages but its view.
-        object_name: the object, where the bag does not say it or says it wrong.
+        record: the episode. The ground truth may be missing, and of each step everything but the view.
+        object_name: the object, if the bag does not name it or names another one.
 
     Raises:
-        ValueError: the object is not known.
+        ValueError: an unknown object.
     """
     name = object_name or record.object
     if name is None:
-        raise ValueError(f"{record.folder}: the bag does not say which object it shows; name it with --object")
-    # The bag's word must not choose a file, so only listed names are loaded.
+        raise ValueError(f"{record.folder}: the bag does not name the object; give it with --object")
+    # A name in a bag must not choose a file, so only listed objects are loaded.
     if name not in list_objects():
         known = ", ".join(list_objects())
-        raise ValueError(f"{record.folder}: object '{name}' is not among {known}; name one with --object")
+        raise ValueError(f"{record.folder}: object '{name}' is not among {known}; give one with --object")
     model = load_object(name)
     truth = record.ground_truth
     positions = record.positions

@@ -1,4 +1,4 @@
-"""Colours of scores and depths, pictures as data URIs, and everything that is drawn onto one view."""
+"""Colours for scores and depths, pictures as data URIs, and the outlines that are drawn onto a view."""
 
 import base64
 import io
@@ -12,7 +12,7 @@ from active6d_core.se3 import invert
 from active6d_tools.report.analysis import EpisodeAnalysis, StepAnalysis
 from active6d_tools.report.silhouette import Outline, SilhouetteDrawer
 
-# Not from red: a red object would swallow it. These differ in brightness, too, for those who see few colours.
+# Not red, which is hard to see on a red object. The colours differ in brightness, too, for colour-blind readers.
 _SCORE_COLORS = np.array([(255, 61, 200), (255, 214, 61), (46, 230, 166)], float)
 
 

@@ -1,4 +1,4 @@
-"""An episode as one picture: its views with outlines coloured by score, its path, and how the score rose."""
+"""An episode as one picture: views with outlines coloured by score, the camera path, and the errors over the views."""
 
 import matplotlib
 import numpy as np
@@ -15,7 +15,7 @@ _MOST_VIEWS = 6
 
 
 def render_png(analysis: EpisodeAnalysis) -> bytes:
-    """PNG of up to six views (first, last, and evenly between), the camera's path and the course of the errors."""
+    """PNG of up to six views (first, last, and evenly between), the camera path and the errors over the views."""
     chosen = np.unique(np.linspace(0, len(analysis.steps) - 1, _MOST_VIEWS).round().astype(int))
     drawer, scale = SilhouetteDrawer(analysis.model), score_scale(analysis)
     with matplotlib.rc_context(panels.STYLE):
@@ -62,4 +62,4 @@ def _draw_course(axes: Axes, steps: list[StepAnalysis]) -> None:
     errors.set_ylim(0, 50)
     errors.tick_params(colors=SOFT, length=3)
     errors.spines[["top", "left"]].set_visible(False)
-    errors.set_title("mean e_ADD, mm", loc="right", size=9, color="#d4572a")
+    errors.set_title("mean ADD, mm", loc="right", size=9, color="#d4572a")

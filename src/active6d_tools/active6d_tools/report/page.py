@@ -1,4 +1,4 @@
-"""An episode as one HTML file that needs nothing else: pictures, drawings and data are inside it."""
+"""An episode as one self-contained HTML file with pictures, drawings and data."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,7 +22,7 @@ _CHART_WIDTH, _CHART_HEIGHT = 300.0, 130.0
 
 @dataclass(frozen=True)
 class Chart:
-    """A line over the episode's views, in the coordinates of its drawing.
+    """A line chart over the views of the episode, in the coordinates of its SVG.
 
     Attributes:
         title: what is drawn, with its unit.
@@ -38,7 +38,7 @@ class Chart:
 
 
 def render_html(analysis: EpisodeAnalysis) -> str:
-    """The whole report as HTML text. What the bag says is escaped: it may hold anything."""
+    """The whole report as HTML text. Text from the bag is escaped."""
     environment = Environment(
         loader=PackageLoader("active6d_tools", "report"),
         autoescape=True,
@@ -92,7 +92,7 @@ class _StepPictures:
 
 
 def _facts(analysis: EpisodeAnalysis) -> list[tuple[str, str]]:
-    """What the bag says of itself and the page does not say elsewhere, and where it lies."""
+    """Information in the bag that is nowhere else on the page, and the path of the bag."""
     shown = {"object", "scene", "policy", "moves", "metres"}
     facts = [(key.replace("_", " "), value) for key, value in analysis.record.info.items() if key not in shown]
     started = analysis.steps[0].record.stamp
@@ -107,7 +107,7 @@ def _charts(steps: list[StepAnalysis]) -> list[Chart]:
         errors = [step.truth.mean_e_add_mm for step in steps]
         return [
             _chart("Objects found, %", rates, 100.0, "{:.0f}"),
-            _chart("Mean e_ADD, mm (missed: 50)", errors, 50.0, "{:.1f}"),
+            _chart("Mean ADD, mm (missed: 50)", errors, 50.0, "{:.1f}"),
         ]
     means = [float(np.mean(step.objects.verification)) if len(step.rows) else 0.0 for step in steps]
     counts = [float(len(step.rows)) for step in steps]
@@ -131,7 +131,7 @@ def _hypothesis_scale(steps: list[StepAnalysis]) -> ScoreScale:
 
 
 def _path_scene(analysis: EpisodeAnalysis, scale: ScoreScale) -> dict:
-    """What the 3D drawing of the path needs, in metres: plain numbers, since it goes into the page as JSON."""
+    """Data of the 3D drawing of the path, in metres, as plain numbers for JSON."""
     last = analysis.steps[-1]
     return {
         "radius": analysis.sphere.radius,

@@ -1,4 +1,4 @@
-"""Panels that the pictures of an episode share: a view with its outlines, the camera's path on the hemisphere."""
+"""Panels of the pictures of an episode: a view with outlines, the camera path on the hemisphere."""
 
 import io
 from itertools import pairwise
@@ -18,7 +18,7 @@ from active6d_tools.report.drawing import ScoreScale, StepOutlines
 ACCENT = "#1769e0"
 INK = "#1b1f24"
 SOFT = "#6b7480"
-#: The bag's own words are drawn as they stand: a "$" in them is no formula.
+#: Text from a bag is drawn literally: a "$" in it starts no formula.
 STYLE = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -38,7 +38,7 @@ def save_png(figure: Figure) -> bytes:
 
 
 def draw_view(axes: Axes, step: StepAnalysis, outlines: StepOutlines, colors: list[str]) -> None:
-    """The image, and on it what is seen of each object in its one of n ``#rrggbb``; the attended one in white, too."""
+    """The image with the visible outline of each object in its colour; the attended one has a white edge, too."""
     view = step.record.view
     axes.imshow(view.color, interpolation="antialiased")
     drawn = zip(step.rows, outlines.objects, colors, strict=True)
@@ -76,7 +76,7 @@ def draw_score_bar(figure: Figure, scale: ScoreScale, x: float, y: float, width:
 
 
 def draw_path(axes: Axes, analysis: EpisodeAnalysis, colors: list[str]) -> None:
-    """Hemisphere, views and arcs, and the last view's objects in their colours, seen from where the path is clearest.
+    """Hemisphere, views, arcs and the objects of the last view, projected so that the path overlaps least.
 
     An orthographic projection of our own: matplotlib's 3D axes cut off what does not fit their box.
     """
@@ -110,7 +110,7 @@ def draw_path(axes: Axes, analysis: EpisodeAnalysis, colors: list[str]) -> None:
 
 
 def _name_ends(axes: Axes, cameras: np.ndarray, path: np.ndarray) -> None:
-    """Words beside the first and last of (t, 2) cameras in the drawing, on the side farthest from the (n, 2) path."""
+    """Label the first and last of (t, 2) cameras in the drawing, on the side farthest from the (n, 2) path."""
     angles = np.arange(16) * np.pi / 8
     around = np.stack([1.5 * np.cos(angles), np.sin(angles)], axis=1)
     size = 0.16 * np.ptp(path, axis=0).max()
@@ -122,7 +122,7 @@ def _name_ends(axes: Axes, cameras: np.ndarray, path: np.ndarray) -> None:
 
 
 def clearest_projection(sphere: ViewSphere, cameras: np.ndarray) -> np.ndarray:
-    """Where to look from so that (t, 3) positions lie least upon each other.
+    """The direction of projection in which (t, 3) positions overlap least.
 
     Returns:
         (3, 3) unit vectors of the world as rows: to the right in the drawing, up in it, and toward the eye.

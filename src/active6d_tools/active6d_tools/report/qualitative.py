@@ -28,9 +28,9 @@ def render_qualitative(analysis: EpisodeAnalysis) -> bytes:
 
 
 def qualitative_figure(analysis: EpisodeAnalysis) -> Figure:
-    """First and last view with what was known then, score and attention of each object at each move, the path.
+    """First and last view with their objects, score and attention of each object at each move, the path.
 
-    Objects are coloured by whether they are found where the bag has ground truth, else by their verification score.
+    Objects are coloured by detection if the bag has ground truth, else by their verification score.
     Of more than five moves, five are drawn: first, last, and evenly between. The axes are labelled ``before``,
     ``after``, ``path``, and ``score N`` and ``attention N`` for move N.
     """
@@ -52,7 +52,7 @@ def qualitative_figure(analysis: EpisodeAnalysis) -> Figure:
 
 
 def _shown_moves(analysis: EpisodeAnalysis) -> list[StepAnalysis]:
-    """The views that moves were decided at."""
+    """The views at which the moves were decided."""
     decided = analysis.steps[:-1]
     if len(decided) <= _MOST_MOVES:
         return decided
@@ -92,12 +92,12 @@ def _mark_attended(axes: Axes, drawer: SilhouetteDrawer, step: StepAnalysis, mov
 
 
 def _draw_moves(figure: Figure, analysis: EpisodeAnalysis, moves: list[StepAnalysis]) -> None:
-    """Two rows of bars, a column a move; a bar is equally wide in all of them, and attention has one scale."""
+    """Two rows of bars, one column per move; all bars have the same width, and attention has one scale."""
     if not moves:
         figure.text(0.5, 0.2, "no move was made", ha="center", va="center", color=SOFT)
         return
-    told = "one bar per object, lowest score first; shaded: attended to"
-    figure.text(0.99, 0.022, told, size=8, color=SOFT, ha="right", va="center")
+    caption = "one bar per object, lowest score first; shaded: attended to"
+    figure.text(0.99, 0.022, caption, size=8, color=SOFT, ha="right", va="center")
     slots = [max(len(move.rows), _LEAST_OF_MOVE) for move in moves]
     columns = slots if sum(slots) >= _LEAST_OF_ALL else [*slots, _LEAST_OF_ALL - sum(slots)]
     place = {"left": 0.06, "right": 0.99, "top": 0.32, "bottom": 0.055, "hspace": 0.0, "wspace": 0.06}
@@ -138,13 +138,13 @@ def _draw_header(figure: Figure, analysis: EpisodeAnalysis) -> None:
     name = analysis.record.scene or analysis.model.name
     title = figure.text(0.01, height, name, size=13, weight="bold", va="center")
     parts = [analysis.record.policy, "1 move" if moves == 1 else f"{moves} moves"]
-    told, beside = "   ".join(part for part in parts if part), {"xycoords": title, "textcoords": "offset points"}
-    figure.add_artist(Annotation(told, (1, 0.5), (12, 0), size=10, color=SOFT, va="center", **beside))
+    subtitle, beside = "   ".join(part for part in parts if part), {"xycoords": title, "textcoords": "offset points"}
+    figure.add_artist(Annotation(subtitle, (1, 0.5), (12, 0), size=10, color=SOFT, va="center", **beside))
     keys = [Line2D([], [], ls="none", marker="s", mfc="white", mec=INK, label="attended to, and for which move")]
     if analysis.record.ground_truth is None:
         panels.draw_score_bar(figure, score_scale(analysis), 0.62, height, 0.09)
     else:
-        found = f"found: e_ADD below {analysis.threshold_mm:.1f} mm"
+        found = f"found: ADD below {analysis.threshold_mm:.1f} mm"
         keys = [Patch(color=_FOUND, label=found), Patch(color=_WRONG, label="wrong pose"), *keys]
     place = {"loc": "center right", "bbox_to_anchor": (1.0, height), "ncols": len(keys)}
     figure.legend(handles=keys, frameon=False, fontsize=9, handlelength=1, columnspacing=1.2, **place)

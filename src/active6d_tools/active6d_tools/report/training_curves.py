@@ -13,6 +13,6 @@ def draw_training(path: Path, title: str, rows: list[dict]) -> None:
     """
     minutes = [row["seconds"] / 60 for row in rows]
     third = ("mean_return", "mean return") if "mean_return" in rows[0] else ("loss", "loss")
-    shown = (("detection_rate", "detection rate"), ("e_add_mm", "e_ADD [mm]"), ("distance_m", "d [m]"), third)
+    shown = (("detection_rate", "detection rate"), ("e_add_mm", "ADD [mm]"), ("distance_m", "d [m]"), third)
     panels = [Panel("minutes", label, {label: (minutes, [row[key] for row in rows])}) for key, label in shown]
     draw_panels(path, f"{title}: validation scenes", panels)

@@ -1,4 +1,4 @@
-"""What was to be shown, and what the paper claims, held against what was measured."""
+"""Goals of the project and claims of the paper, compared with the measurements."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Any
 
 from active6d_tools.results.tables import MEASURES, interval, number, percent, table
 
-#: What an object's commands wrote, by the name of the command in :mod:`active6d_tools.results.page`.
+#: Results of one object by the name of the job in :mod:`active6d_tools.results.page`.
 Measured = Mapping[str, dict[str, Any]]
 DEFAULT, PAPERS = "view-attention", "attention"
 BASELINES = ("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score")
@@ -14,7 +14,7 @@ BASELINES = ("single-view", "random", "max-distance", "unidirectional", "entropy
 
 @dataclass(frozen=True)
 class Verdict:
-    """Of one object: whether it is so, and the figures; ``caveat`` is what limits a yes."""
+    """Whether a goal is met for one object, and the figures; ``caveat`` limits a yes."""
 
     met: bool
     figures: str
@@ -24,7 +24,7 @@ class Verdict:
 def goals_table(
     goals: Mapping[str, Callable[[Measured], Verdict]], measured: Mapping[str, Measured], word: str = "met"
 ) -> str:
-    """Goals down, objects across; "not measured" where a command has not been run or lacks the policy."""
+    """Goals as rows, objects as columns; "not measured" if a result or its policy is missing."""
     rows = []
     for text, judge in goals.items():
         cells = [text]
@@ -41,16 +41,16 @@ def goals_table(
 
 
 def beats(report: dict[str, Any], name: str, others: Iterable[str], keys: Sequence[str]) -> Verdict:
-    """Whether a policy is better than each of the others by each measure; names where it leads least."""
+    """Whether a policy is better than each of the others by each measure, and its smallest lead."""
     against = report["policies"][name]["against"]
     leads = []
     for other in others:
         for key in keys:
             difference, (unit, digits, better) = against[other][key], MEASURES[key]
             ends = sorted(better * end for end in difference["ci95_scenes"])
-            told = number(difference["mean"], digits, True) + unit
-            figures = f"{told} against `{other}` {interval(difference['ci95_scenes'], digits, True)}"
-            # In units of its uncertainty, so that rates and millimetres compare.
+            lead = number(difference["mean"], digits, True) + unit
+            figures = f"{lead} against `{other}` {interval(difference['ci95_scenes'], digits, True)}"
+            # In units of the uncertainty, so that rates and millimetres are comparable.
             leads.append(
                 (ends[0] / max(ends[1] - ends[0], 1e-12), difference["mean"] * better > 0, difference, figures)
             )
@@ -77,22 +77,22 @@ def _gap(own: Measured) -> Verdict:
 
 def _five_like_ten(own: Measured) -> Verdict:
     five, ten = own["evaluate"]["policies"][DEFAULT], own["evaluate_ten"]["policies"]["random"]
-    told, met = [], True
+    figures, met = [], True
     for key in ("detection_rate", "e_add_mm"):
         unit, digits, better = MEASURES[key]
         met &= better * (five[key] - ten[key]) >= 0
-        told.append(f"{number(five[key], digits)}{unit}, `random` with 10 {number(ten[key], digits)}{unit}")
-    return Verdict(met, "; ".join(told))
+        figures.append(f"{number(five[key], digits)}{unit}, `random` with 10 {number(ten[key], digits)}{unit}")
+    return Verdict(met, "; ".join(figures))
 
 
 def _attention_learned(own: Measured) -> Verdict:
     lowest = own["attention"]["rows"][1]
     against = lowest["against_first"]
     found, error = against["detection_rate"], against["e_add_mm"]
-    told = f"{number(-found['mean'], 3, True)} found, e_ADD {percent(-error['mean'] / lowest['e_add_mm'], True)}"
+    figures = f"{number(-found['mean'], 3, True)} found, e_ADD {percent(-error['mean'] / lowest['e_add_mm'], True)}"
     met = found["mean"] < 0 < error["mean"] and found["excludes_zero"] and error["excludes_zero"]
     surely = found["excludes_zero_scenes"] and error["excludes_zero_scenes"]
-    return Verdict(met, told, "over starts, not over scenes" if met and not surely else "")
+    return Verdict(met, figures, "over starts, not over scenes" if met and not surely else "")
 
 
 def _trained_in_time(own: Measured) -> Verdict:
@@ -103,8 +103,8 @@ def _trained_in_time(own: Measured) -> Verdict:
 def _seeds(own: Measured) -> Verdict:
     rows = [row for row in own["seeds"]["rows"] if row["policy"] == DEFAULT]
     rates = [row["detection_rate"] for row in rows]
-    told = f"{number(min(rates), 3)} to {number(max(rates), 3)} found"
-    return Verdict(len(rows) >= 3 and any(row["shipped"] and row["best_on_validation"] for row in rows), told)
+    figures = f"{number(min(rates), 3)} to {number(max(rates), 3)} found"
+    return Verdict(len(rows) >= 3 and any(row["shipped"] and row["best_on_validation"] for row in rows), figures)
 
 
 def _faster(job: str, key: str, least: float, aim: float, unit: str) -> Callable[[Measured], Verdict]:
@@ -159,8 +159,8 @@ def _too_much_closeness(own: Measured) -> Verdict:
 def _no_closeness(own: Measured) -> Verdict:
     rows = {float(row["variant"]): row for row in own["alpha"]["rows"]}
     best = min(rows, key=lambda alpha: rows[alpha]["e_add_mm"])
-    told = f"{rows[0.0]['e_add_mm']:.2f} mm at alpha 0, {rows[best]['e_add_mm']:.2f} mm at {best:g}, the best"
-    return Verdict(best > 0 and rows[best]["against_first"]["e_add_mm"]["excludes_zero"], told)
+    figures = f"{rows[0.0]['e_add_mm']:.2f} mm at alpha 0, {rows[best]['e_add_mm']:.2f} mm at {best:g}, the best"
+    return Verdict(best > 0 and rows[best]["against_first"]["e_add_mm"]["excludes_zero"], figures)
 
 
 CLAIMS: dict[str, Callable[[Measured], Verdict]] = {

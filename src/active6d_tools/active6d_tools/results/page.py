@@ -1,4 +1,4 @@
-"""Which commands make docs/results.md, and how what they wrote gets into it: no number there is typed by hand."""
+"""The commands whose results are in docs/results.md, and the generated parts of that page."""
 
 import json
 import re
@@ -19,11 +19,11 @@ class Job:
     """One command, run for each object.
 
     Attributes:
-        name: of what it measures; part of its files' names.
-        command: of ``active6d``, without object and files.
+        name: of the job; part of the names of its files.
+        command: arguments of ``active6d``, without object and files.
         draws: whether it draws a figure.
-        trains: whether it trains, which takes longer than anything else.
-        times: whether it measures time, and so wants the machine for itself.
+        trains: whether it trains, which takes hours.
+        times: whether it measures times, and must run alone on the machine.
     """
 
     name: str
@@ -37,16 +37,16 @@ class Job:
         return f"{_REPORTS}/{self.name}_{object_name}.json"
 
     def figure(self, object_name: str) -> str:
-        """The PNG file, where it draws one."""
+        """The PNG file, if it draws one."""
         return f"{_FIGURES}/results_{self.name}_{object_name}.png"
 
     def arguments(self, object_name: str) -> list[str]:
-        """Of ``active6d``, in the repository."""
+        """Arguments of ``active6d``; paths are relative to the repository."""
         drawn = ["--png", self.figure(object_name)] if self.draws else []
         return [*self.command.split(), "--object", object_name, "--json", self.report(object_name), *drawn]
 
     def is_done(self, root: Path, object_name: str) -> bool:
-        """Whether its files are there."""
+        """Whether its files exist."""
         files = [self.report(object_name), *([self.figure(object_name)] if self.draws else [])]
         return all((root / file).is_file() for file in files)
 
@@ -80,7 +80,7 @@ JOBS = {
 
 
 def read_reports(root: Path) -> dict[str, Measured]:
-    """What was measured, by object and job, for those whose files are there.
+    """Results by object and job, of those jobs that have been run.
 
     Raises:
         ValueError: a file is damaged; the message names it.
@@ -94,15 +94,15 @@ def read_reports(root: Path) -> dict[str, Measured]:
                 try:
                     measured[name][job.name] = json.loads(path.read_text())
                 except ValueError as error:
-                    raise ValueError(f"{path}: no report ({error}); delete it and make it again") from error
+                    raise ValueError(f"{path}: damaged result ({error}); delete it and measure it again") from error
     return measured
 
 
 def fill(page: str, measured: Mapping[str, Measured]) -> str:
-    """Renew every block of a page between ``<!-- results: NAME -->`` and ``<!-- end -->``.
+    """Generate every block of a page between ``<!-- results: NAME -->`` and ``<!-- end -->`` again.
 
     Raises:
-        ValueError: a block that nobody knows how to make.
+        ValueError: an unknown block.
     """
 
     def renew(match: re.Match) -> str:
@@ -122,7 +122,7 @@ def _command(name: str) -> str:
 
 
 def _block(name: str, make: Callable[[tables.Reports], str]) -> Callable[[Mapping[str, Measured]], str]:
-    """The command, then a table of what it wrote."""
+    """The command, then a table of its results."""
 
     def render(measured: Mapping[str, Measured]) -> str:
         reports = _of_job(name, measured)
@@ -135,7 +135,7 @@ def _block(name: str, make: Callable[[tables.Reports], str]) -> Callable[[Mappin
 
 
 def _each(make: Callable[[dict[str, Any]], str]) -> Callable[[tables.Reports], str]:
-    """One table an object, under its name."""
+    """One table per object, under its name."""
 
     def render(reports: tables.Reports) -> str:
         return "\n\n".join(

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure every table and figure of docs/results.md and write them into it."""
+"""Measure every table and figure of docs/results.md and write them to that page."""
 
 import os
 import subprocess
@@ -23,9 +23,9 @@ def run(job: Job, object_name: str) -> None:
     """Run one command in the repository.
 
     Raises:
-        RuntimeError: it failed; its last words.
+        RuntimeError: it failed; the message is the end of its output.
     """
-    # Networks this small gain nothing from threads, and wait for each other's where several commands run.
+    # Small networks gain nothing from threads, and several commands run at the same time.
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "active6d_tools", *job.arguments(object_name)]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -34,7 +34,7 @@ def run(job: Job, object_name: str) -> None:
 
 
 def run_all(jobs: list[tuple[Job, str]], workers: int) -> list[str]:
-    """Run commands side by side; what went wrong, a line each."""
+    """Run commands in parallel; one line for each failure."""
     failures: list[str] = []
     if not jobs:
         return failures
@@ -51,17 +51,15 @@ def run_all(jobs: list[tuple[Job, str]], workers: int) -> list[str]:
 
 @app.command()
 def main(
-    only: Annotated[str, typer.Option(help=f"Names separated by commas, of {', '.join(JOBS)}.")] = ",".join(JOBS),
+    only: Annotated[str, typer.Option(help=f"Names of jobs, separated by commas: {', '.join(JOBS)}.")] = ",".join(JOBS),
     objects: Annotated[str, typer.Option(help="Objects separated by commas.")] = ",".join(OBJECTS),
-    trainings: Annotated[bool, typer.Option(help="Also what trains policies: hours, where nothing is trained yet.")] = (
-        False
-    ),
-    again: Annotated[bool, typer.Option("--again", help="Measure also what is there already.")] = False,
-    workers: Annotated[int, typer.Option(min=1, help="Commands at once; times are measured alone.")] = (
+    trainings: Annotated[bool, typer.Option(help="Also run jobs that train policies; this takes hours.")] = (False),
+    again: Annotated[bool, typer.Option("--again", help="Measure again what has been measured.")] = False,
+    workers: Annotated[int, typer.Option(min=1, help="Number of parallel commands; times are measured alone.")] = (
         os.cpu_count() or 1
     ),
 ) -> None:
-    """Measure what docs/results.md shows and is not there yet, and write its tables anew.
+    """Run the missing measurements of docs/results.md and generate its tables.
 
     Example: [bold]python -m active6d_tools.results.reproduce --only steps,planning --objects mug --again[/bold]
     """
@@ -75,7 +73,7 @@ def main(
         if (trainings or not JOBS[name].trains) and (again or not JOBS[name].is_done(ROOT, object_name.strip()))
     ]
     failures = run_all([pair for pair in wanted if not (pair[0].trains or pair[0].times)], workers)
-    # One training after the other, objects side by side: ablations share trainings.
+    # One training job after the other, because ablations share trainings; objects in parallel.
     for job in (job for job in JOBS.values() if job.trains):
         failures += run_all([pair for pair in wanted if pair[0] is job], workers)
     failures += run_all([pair for pair in wanted if pair[0].times], 1)

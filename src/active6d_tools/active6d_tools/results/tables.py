@@ -1,12 +1,12 @@
-"""What ``active6d evaluate`` and ``active6d ablate`` wrote, as Markdown tables for docs/results.md.
+"""Results of ``active6d evaluate`` and ``active6d ablate`` as Markdown tables for docs/results.md.
 
-A cell says whether its difference from what it is compared with excludes zero, so that a loss is as visible as a win.
+A mark in a cell shows whether the interval of its difference excludes zero, for improvements and losses alike.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-#: An object's name to what a command wrote about it.
+#: Results of a command by object.
 Reports = Mapping[str, dict[str, Any]]
 
 #: Key, unit, digits, and the sign of a change for the better (0 for neither).
@@ -43,24 +43,24 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def number(value: float, digits: int, sign: bool = False) -> str:
-    """A number as docs print it: no zero before the point."""
+    """A number without the zero before the decimal point."""
     text = f"{value:{'+' if sign else ''}.{digits}f}"
     return text.replace("0.", ".", 1) if abs(value) < 1 and digits == 3 else text
 
 
 def percent(share: float, sign: bool = False) -> str:
-    """A share in hundredths."""
+    """A share in percent."""
     return f"{100 * share:{'+' if sign else ''}.0f} %"
 
 
 def interval(ends: Sequence[float], digits: int, sign: bool = False) -> str:
-    """Two ends in brackets."""
+    """An interval in brackets."""
     return f"({' to '.join(number(end, digits, sign) for end in ends)})"
 
 
 def mark(difference: dict[str, Any], better: int) -> str:
-    """``✓`` better and ``✗`` worse where the interval over scenes excludes zero, in brackets where only that over
-    episodes does, ``=`` where neither does."""
+    """``✓`` better or ``✗`` worse if the interval over scenes excludes zero, in brackets if only the one over episodes
+    does, ``=`` if neither does."""
     if better == 0:
         return ""
     if not (difference["excludes_zero"] or difference["excludes_zero_scenes"]):
@@ -88,7 +88,7 @@ def policies_table(report: dict[str, Any]) -> str:
 
 
 def differences_table(report: dict[str, Any], name: str) -> str:
-    """A policy against every other, start by start: its value less theirs."""
+    """A policy minus every other, paired by start."""
     keys = ("detection_rate", "e_add_mm", "distance_m")
     rows = []
     for other, difference in report["policies"][name]["against"].items():
@@ -96,14 +96,14 @@ def differences_table(report: dict[str, Any], name: str) -> str:
         for key in keys:
             _, digits, better = MEASURES[key]
             own = difference[key]
-            told = f"{number(own['mean'], digits, True)} {interval(own['ci95_scenes'], digits, True)}"
-            cells.append(f"{mark(own, better)} {told}")
+            text = f"{number(own['mean'], digits, True)} {interval(own['ci95_scenes'], digits, True)}"
+            cells.append(f"{mark(own, better)} {text}")
         rows.append(cells)
     return table([f"`{name}` less", "detection rate", "e_ADD, mm", "d, m"], rows)
 
 
 def variants_table(reports: Reports, keys: Sequence[str]) -> str:
-    """Variants down, objects across; a mark where a variant is compared with the first."""
+    """Variants as rows, objects as columns; marks compare a variant with the first."""
     return _pivot(reports, lambda row: row["variant"], lambda row: describe_row(row, keys))
 
 
@@ -119,49 +119,49 @@ def describe_row(row: dict[str, Any], keys: Sequence[str]) -> str:
 
 
 def seeds_table(reports: Reports) -> str:
-    """Every training: found, e_ADD; found on validation scenes; minutes; which one ships."""
+    """Every training: detection rate, error, validation result, minutes, and whether it is shipped."""
 
-    def tell(row: dict[str, Any]) -> str:
+    def render(row: dict[str, Any]) -> str:
         found = describe_row(row, ("detection_rate", "e_add_mm"))
         chosen = "**best**" * row["best_on_validation"]
         ships = "ships" * row["shipped"]
         on_validation = f"validation {number(row['validation_detection_rate'], 3)} {chosen}".strip()
         return ", ".join(filter(None, (found, on_validation, f"{row['training_minutes']:.0f} min", ships)))
 
-    return _pivot(reports, lambda row: row["variant"], tell)
+    return _pivot(reports, lambda row: row["variant"], render)
 
 
 def steps_tables(reports: Reports) -> str:
-    """Of every object: budgets T down, found and e_ADD of policies across."""
+    """One table per object: budgets T as rows, detection rate and error of policies as columns."""
     parts = []
     for name, report in reports.items():
         rows = {(row["budget"], row["variant"]): row for row in report["rows"]}
         budgets, policies = (list(dict.fromkeys(names)) for names in zip(*rows, strict=True))
-        told = ("detection_rate", "e_add_mm")
-        lines = ([str(T), *(describe_row(rows[T, policy], told) for policy in policies)] for T in budgets)
+        measures = ("detection_rate", "e_add_mm")
+        lines = ([str(T), *(describe_row(rows[T, policy], measures) for policy in policies)] for T in budgets)
         parts += [f"**{name}**", table(["T", *(f"`{policy}`" for policy in policies)], lines)]
     return "\n\n".join(parts)
 
 
 def noise_resampling_table(reports: Reports) -> str:
-    """Whose views and with which noise down: found, e_ADD, and the share of the gap with its interval over scenes."""
+    """Policies and noise as rows: detection rate, error, and the share of the gap with its interval over scenes."""
 
-    def tell(row: dict[str, Any]) -> str:
+    def render(row: dict[str, Any]) -> str:
         share, (low, high) = row["gap_closed"], row["gap_closed_ci95_scenes"]
         ends = f" ({100 * low:.0f} to {100 * high:.0f})" if high - low > 0.005 else ""
         return f"{describe_row(row, ('detection_rate', 'e_add_mm'))}, {percent(share)}{ends}"
 
-    return _pivot(reports, lambda row: f"`{row['policy']}`, {row['noise']} noise", tell)
+    return _pivot(reports, lambda row: f"`{row['policy']}`, {row['noise']} noise", render)
 
 
-def _pivot(reports: Reports, key: Callable[[dict], str], tell: Callable[[dict], str]) -> str:
-    columns = [{key(row): tell(row) for row in report["rows"]} for report in reports.values()]
+def _pivot(reports: Reports, key: Callable[[dict], str], render: Callable[[dict], str]) -> str:
+    columns = [{key(row): render(row) for row in report["rows"]} for report in reports.values()]
     names = list(dict.fromkeys(name for column in columns for name in column))
     return table(["", *reports], ([name, *(column.get(name, "") for column in columns)] for name in names))
 
 
 def environment_table(reports: Reports) -> str:
-    """Training steps a second."""
+    """Steps of the training environment per second."""
     header = ["", "steps a second", "processes"]
     return table(
         header, ([name, f"{own['steps_per_second']:,.0f}", str(own["workers"])] for name, own in reports.items())
@@ -169,7 +169,7 @@ def environment_table(reports: Reports) -> str:
 
 
 def pipeline_table(reports: Reports) -> str:
-    """What the last of six views costs behind the estimator."""
+    """Times of the last of six views after the estimator."""
     header = ["", "objects", "verification", "fusion", "policy", "all", "a decision, 99th percentile"]
     rows = []
     for name, own in reports.items():
