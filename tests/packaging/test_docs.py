@@ -10,6 +10,7 @@ from unittest import mock
 
 import pytest
 import typer
+import yaml
 
 from active6d_tools.cli import app
 
@@ -178,3 +179,13 @@ def test_no_page_is_left_out():
     if tracked.returncode:
         pytest.skip("not a git checkout")
     assert {ROOT / name for name in tracked.stdout.split()} <= set(PAGES)
+
+
+def test_the_citation_names_the_version_and_the_paper():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    versions = {re.search(r'version="(.+?)"', setup.read_text())[1] for setup in ROOT.glob("src/*/setup.py")}
+    assert {citation["version"]} == versions
+    assert {"cff-version", "message", "title", "authors"} <= citation.keys()
+    paper = citation["preferred-citation"]
+    assert paper["title"] in " ".join((ROOT / "README.md").read_text().split())
+    assert [author["family-names"] for author in paper["authors"]] == ["Sock", "Garcia-Hernando", "Kim"]
