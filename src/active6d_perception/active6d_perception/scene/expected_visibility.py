@@ -1,11 +1,11 @@
-"""How much of every known object a camera would see from places where it has not been.
+"""Predicts how much of each known object a camera would see from other views.
 
-Objects hide each other. For points spread over an object's outline, the silhouettes of the objects between say whether
-they are hidden. Silhouettes are looked up among those of directions all around the model, which takes a small part of
-the time that rendering a hundred views would.
+Objects hide each other. Points are spread over an object's outline, and the silhouettes of the objects in between show
+which points are hidden. Silhouettes are precomputed for directions all around the model, which is much faster than
+rendering a hundred views.
 
-The outline is the mean of all directions' outlines, whichever way the object is turned: what needs another view has a
-hypothesis that is wrong, or none, and of it this tells more than the outline of a wrong pose does.
+The outline is the mean over all directions and does not depend on the object's orientation. An object that needs
+another view has no hypothesis or a wrong one. Then the mean outline predicts more than the outline of a wrong pose.
 """
 
 from functools import lru_cache
@@ -21,80 +21,80 @@ from active6d_perception.model.model_views import ray_caster
 
 _SUBDIVISIONS = 2  # of an icosahedron: 162 directions
 _PIXELS = 24  # across a silhouette
-# Points of an object that are looked for, a multiple of sixteen: so many processors work on at once.
+# Number of points per object; a multiple of sixteen, which suits vector instructions.
 _POINTS = 32
-# Farther off the ray than this, in reaches of the model from its origin, no object hides much of another.
+# An object farther than this off the ray hides little; in units of the model's largest radius.
 _SIDEWAYS = 1.5
-# Nothing closer in front of a point than this fraction of the diameter hides it: poses are not exact.
+# Surface less than this fraction of the diameter in front of a point does not hide it, because poses are not exact.
 _CLEARANCE = 0.02
 
 
 @lru_cache(maxsize=16)
 def expected_visibility(model: ObjectModel) -> "ExpectedVisibility":
-    """That of ``model``, made once per process."""
+    """The expected visibility of ``model``, computed once per process."""
     return ExpectedVisibility(model)
 
 
 class Tray(NamedTuple):
-    """Walls around the world's origin, metres."""
+    """The walls of a square bin around the world's origin."""
 
     width: float
-    """between the inner walls, along world x and y"""
+    """between the inner walls, along world x and y, metres"""
     wall_height: float
-    """above the floor at z = 0"""
+    """above the floor at z = 0, metres"""
 
     @classmethod
     def for_model(cls, model: ObjectModel) -> "Tray":
-        """The bin that an object's heap usually lies in."""
+        """The bin that the object's heaps usually lie in."""
         return cls(model.bin_width, model.wall_height)
 
 
-#: No walls at all.
+#: A table without walls.
 OPEN_TABLE = Tray(0.0, -np.inf)
 
 
 class _Stand(NamedTuple):
-    """Objects as V eyes see them."""
+    """The objects relative to V camera positions."""
 
     centres: np.ndarray
-    """(n, 3) world"""
+    """(n, 3) origins of the objects, world, metres"""
     rays: np.ndarray
-    """(n, V, 3) unit vectors to the eyes, world"""
+    """(n, V, 3) unit vectors from the objects to the cameras, world"""
     distance: np.ndarray
-    """(n, V) to the eyes, metres"""
+    """(n, V) distances to the cameras, metres"""
     right: np.ndarray
     """(n, V, 3) unit vectors along the silhouette's rows, world"""
     up: np.ndarray
-    """(n, V, 3) likewise along its columns"""
+    """(n, V, 3) unit vectors along the silhouette's columns, world"""
     nearest: np.ndarray
-    """(n, V) index of the precomputed direction"""
+    """(n, V) index of the nearest precomputed direction"""
 
 
 class _Silhouettes(NamedTuple):
-    """A model from m directions, and what it takes to be hidden behind it."""
+    """Silhouettes of a model from m directions, and the tolerances for being hidden behind it."""
 
     front: np.ndarray
-    """(m, 1 + pixels * pixels) how far the surface comes towards the eye, metres; -inf for none, and in front"""
+    """(m, 1 + pixels * pixels) height of the surface towards the camera, metres; -inf without surface"""
     pixels_per_metre: np.float32
     sideways: np.float32
-    """farther off a ray than this, from the model's origin, metres, it hides nothing"""
+    """an object hides nothing from a ray that passes its origin farther away than this, metres"""
     clearance: np.float32
-    """nor what lies less than this behind its surface, metres"""
+    """an object hides nothing less than this behind its surface, metres"""
 
 
 @compiled
 def _shares(
     disc: np.ndarray, eyes: np.ndarray, tray: Tray, stand: _Stand, hiding: int, silhouettes: _Silhouettes
 ) -> np.ndarray:
-    """What is left of objects' outlines; all numbers are float32.
+    """Compute the visible shares of the objects' outlines; all numbers are float32.
 
     Args:
-        disc: (3, p) points of any outline: along the silhouette's rows, its columns and towards the eye, metres.
-        eyes: (V, 3) world.
-        tray: walls.
-        stand: of the objects.
-        hiding: so many of them hide others.
-        silhouettes: of the objects.
+        disc: (3, p) points of an outline: along the silhouette's rows, its columns and towards the camera, metres.
+        eyes: (V, 3) camera positions, world, metres.
+        tray: the walls.
+        stand: the objects relative to the cameras.
+        hiding: only the first ``hiding`` objects hide others.
+        silhouettes: of the model.
 
     Returns:
         (n, V) shares of the points that neither a wall nor another object hides.
@@ -104,7 +104,7 @@ def _shares(
     nearer, pixel, between = np.empty(p, np.float32), np.empty(p, np.uint32), np.empty(V, np.bool_)
     for target in range(n):
         _outline(target, disc, eyes, tray, stand, outlines, hidden)
-        # Views last: neighbouring ones have the same objects in between, which makes the branch foreseeable.
+        # The loop over views is the inner one: neighbouring views take the same branch, which a processor can predict.
         for hider in range(hiding):
             _find_between(target, hider, stand, silhouettes.sideways, between)
             for view in range(V):
@@ -128,7 +128,7 @@ def _outline(
     outlines: np.ndarray,
     hidden: np.ndarray,
 ) -> None:
-    """Set (V, 3, p) ``outlines`` to the points that the eyes look for, and (V, p) ``hidden`` where walls hide them."""
+    """Set (V, 3, p) ``outlines`` to the object's points in the world, and (V, p) ``hidden`` where walls hide them."""
     for view in range(len(eyes)):
         for axis in range(3):
             right, up = stand.right[target, view, axis], stand.up[target, view, axis]
@@ -142,8 +142,8 @@ def _outline(
 
 @compiled
 def walled(point: np.ndarray, eye: np.ndarray, tray: Tray) -> bool:
-    """Whether the ray from a (3,) point to an (3,) eye leaves the tray through a wall; all float32."""
-    # Along the ray, from 0 at the point to 1 at the eye.
+    """Whether the ray from a (3,) point to a (3,) camera position leaves the bin through a wall; world, float32."""
+    # Parameter along the ray: 0 at the point, 1 at the camera.
     leaves = np.float32(np.inf)
     for axis in range(2):
         ray = eye[axis] - point[axis]
@@ -154,7 +154,7 @@ def walled(point: np.ndarray, eye: np.ndarray, tray: Tray) -> bool:
 
 @compiled
 def _find_between(target: int, hider: int, stand: _Stand, sideways: np.float32, between: np.ndarray) -> None:
-    """Set (V,) ``between`` where an object is in front of another, and close to the ray from there to the eye."""
+    """Set (V,) ``between`` where object ``hider`` is near the ray from ``target`` to the camera."""
     x = stand.centres[hider, 0] - stand.centres[target, 0]
     y = stand.centres[hider, 1] - stand.centres[target, 1]
     z = stand.centres[hider, 2] - stand.centres[target, 2]
@@ -174,11 +174,12 @@ def _project(
     nearer: np.ndarray,
     pixel: np.ndarray,
 ) -> None:
-    """Where (V, 3, p) points are in the silhouette of an object.
+    """Project the points (V, 3, p) of one view into the silhouette of object ``hider``.
 
-    Sets (p,) ``nearer`` to how far surface in front of them must come, and ``pixel``, 0 beside the silhouette.
+    Sets (p,) ``nearer`` to the height above which surface hides the point, and (p,) ``pixel`` to the index into the
+    silhouette, 0 outside.
     """
-    # Numbers and no branches, so that it works on many points at once.
+    # Scalars and no branches, so that the compiler can use vector instructions.
     x0, y0, z0 = stand.centres[hider, 0], stand.centres[hider, 1], stand.centres[hider, 2]
     right_x, right_y, right_z = stand.right[hider, view, 0], stand.right[hider, view, 1], stand.right[hider, view, 2]
     up_x, up_y, up_z = stand.up[hider, view, 0], stand.up[hider, view, 1], stand.up[hider, view, 2]
@@ -198,7 +199,7 @@ def _project(
 
 @compiled
 def _look(centres: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, V, 3) unit vectors from (n, 3) centres to (V, 3) eyes, and (n, V) the distances."""
+    """(n, V, 3) unit vectors from (n, 3) centres to (V, 3) camera positions, and (n, V) distances."""
     rays, distance = np.empty((len(centres), *eyes.shape), np.float32), np.empty((len(centres), len(eyes)), np.float32)
     for target, view in np.ndindex(distance.shape):
         x = eyes[view, 0] - centres[target, 0]
@@ -212,7 +213,7 @@ def _look(centres: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @compiled
 def _square(right: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Make (n, V, 3) ``right`` unit vectors square to the rays, in place; (n, V, 3) what is square to both."""
+    """Make (n, V, 3) ``right`` unit vectors orthogonal to the rays, in place; returns their cross products."""
     up = np.empty_like(right)
     for index in np.ndindex(right.shape[:2]):
         x, y, z = rays[index]
@@ -226,10 +227,10 @@ def _square(right: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
 
 class ExpectedVisibility:
-    """Shares of posed objects that views would see past the other objects.
+    """Predicts the visible shares of objects in views.
 
     Args:
-        model: the object that all poses are of.
+        model: the object that all poses belong to.
     """
 
     def __init__(self, model: ObjectModel) -> None:
@@ -250,7 +251,7 @@ class ExpectedVisibility:
             np.float32(_CLEARANCE * model.diameter),
         )
         self._disc = self._spread_points(front)
-        # Now, so that no decision waits for the compiler.
+        # Compile now, so that no decision has to wait.
         self.shares(np.eye(4)[None], np.array([[0.0, 0.0, 4 * self._reach]]))
 
     def _look_from(self, mesh: trimesh.Trimesh, frames: np.ndarray) -> np.ndarray:
@@ -273,7 +274,7 @@ class ExpectedVisibility:
         radius = np.hypot(*np.meshgrid(self._pixel_centres, self._pixel_centres))
         order = np.argsort(radius, axis=None)
         inner = np.cumsum(covered.ravel()[order])
-        # A sunflower's seeds, each for as much of the silhouette as every other.
+        # A sunflower pattern, in which each point represents the same area of the silhouette.
         seed = np.arange(_POINTS)
         r = np.interp((seed + 0.5) / _POINTS, inner / inner[-1], radius.ravel()[order])
         near = covered * np.exp(-((radius - r[:, None, None]) ** 2) * (_PIXELS / (2 * self._reach)) ** 2)
@@ -284,13 +285,13 @@ class ExpectedVisibility:
     def shares(
         self, T_world_object: np.ndarray, eyes: np.ndarray, tray: Tray | None = None, hiding: int | None = None
     ) -> np.ndarray:
-        """What the eyes would see of the objects.
+        """Predict the visible share of each object from each camera position.
 
         Args:
-            T_world_object: (n, 4, 4), world, metres.
-            eyes: (V, 3) positions of cameras, world, metres, outside the objects.
-            tray: that all of it lies in, None for an open table.
-            hiding: only the first so many objects hide others, all when None.
+            T_world_object: (n, 4, 4) poses in the world, metres.
+            eyes: (V, 3) camera positions outside the objects, world, metres.
+            tray: the bin that the objects lie in, None for an open table.
+            hiding: only the first ``hiding`` objects hide others; all when None.
 
         Returns:
             (n, V) in [0, 1]: share of each object's silhouette that no other object and no wall hides.
@@ -306,8 +307,8 @@ class ExpectedVisibility:
         centres = T_world_object[:, :3, 3].astype(np.float32)
         rays, distance = _look(centres, eyes)
         nearest = ((rays @ R).reshape(-1, 3) @ self._directions.T).argmax(axis=1).reshape(distance.shape)
-        # The silhouette is that of the nearest direction, its place in the world is the eye's own: what lies far behind
-        # would be shifted otherwise.
+        # The silhouette is that of the nearest precomputed direction, but it is placed along the camera's own ray.
+        # Otherwise it would be shifted against objects far behind.
         right = self._right[nearest] @ R.transpose(0, 2, 1)
         up = _square(right, rays)
         return _Stand(centres, rays, distance, right, up, nearest)

@@ -1,8 +1,8 @@
-"""The surface that depth images have shown, and the part of it that no accumulated object explains.
+"""The surface that depth images have shown, and the unexplained part of it: surface that belongs to no known object.
 
-Objects that an estimator misses in every view taken are mostly seen in part: depth images show surface where there is
-no object yet, and a policy can look there again. Surface is kept as the cells of a grid over the inside of the bin, so
-that a view is a row of bits, a scene the union of its views, and a bank of views small.
+An object that the estimator misses in every view is usually still seen in part. Its surface is unexplained, and a
+policy can look there again. Surface is stored as cells of a grid over the inside of the bin. A view is then a row of
+bits, a scene is the union of its views, and a bank of many views is small.
 """
 
 from dataclasses import dataclass
@@ -16,31 +16,31 @@ from active6d_core.object_model import ObjectModel
 from active6d_perception.compiled import compiled
 from active6d_perception.model.model_views import ray_caster
 
-# Images are thinned to about this focal length in pixels (every second pixel each way of a VGA image), so that what is
-# seen depends little on their resolution; a cell counts as seen with this many pixels in it.
+# Images are subsampled to about this focal length in pixels (every second row and column of a VGA image), so that the
+# result depends little on their resolution. A cell counts as seen if it holds this many pixels.
 _FOCAL = 277.0
 _LEAST_POINTS = 3
 # Edge of a voxel of the distance field, in diameters.
 _VOXEL = 1 / 48
-#: Default of how near surface is to an object that explains it, in diameters: more would take surface of its
-#: neighbours for the object's, less would leave what poses that are a little off do not reach.
+#: Default of the distance within which an object explains surface, in diameters. A larger distance would explain
+#: surface of the object's neighbours; with a smaller one a slightly wrong pose would leave surface unexplained.
 EXPLAINED_WITHIN = 0.08
 
 
 @dataclass(frozen=True)
 class SurfaceGrid:
-    """Axis-aligned cells over the workspace: a box centred above the world's origin.
+    """A grid of axis-aligned cells over the workspace, centred above the world's origin.
 
     Cells are numbered ``(ix * ny + iy) * nz + iz``, each index rising along its axis.
 
     Attributes:
-        width: of the box along world x and y, metres; walls should be outside.
-        floor: lower end of the box along world z, metres; the bin's floor should be below.
-        height: upper end of the box along world z, metres.
+        width: of the grid along world x and y, metres; the bin's walls should be outside.
+        floor: lower end of the grid along world z, metres; the bin's floor should be below.
+        height: upper end of the grid along world z, metres.
         cell: edge of a cell, metres.
 
     Raises:
-        ValueError: a size is not finite, or there is no cell, or there are more than a million.
+        ValueError: a size is not finite, or the grid has no cell or more than a million.
     """
 
     width: tuple[float, float]
@@ -57,8 +57,10 @@ class SurfaceGrid:
 
     @classmethod
     def for_model(cls, model: ObjectModel) -> "SurfaceGrid":
-        """The grid over the bin that an object's heap usually lies in; margins keep the sensor's noise on walls and
-        floor out (measured in `docs/perception.md`)."""
+        """The grid over the bin that the object's heaps usually lie in.
+
+        Margins exclude the sensor's noise on walls and floor (measured in ``docs/perception.md``).
+        """
         width = model.bin_width - 0.08 * model.diameter
         return cls((width, width), 0.05 * model.diameter, 1.5 * model.diameter, model.diameter / 12)
 
@@ -73,17 +75,17 @@ class SurfaceGrid:
 
     @cached_property
     def low(self) -> np.ndarray:
-        """(3,) the corner that indices count from, metres in the world."""
+        """(3,) corner of the first cell, world, metres."""
         return np.array([-0.5 * self.shape[0] * self.cell, -0.5 * self.shape[1] * self.cell, self.floor])
 
     @cached_property
     def centres(self) -> np.ndarray:
-        """(cells, 3) metres in the world, numbers that float32 holds: messages carry no others."""
+        """(cells, 3) centres of the cells, world, metres; rounded to float32, as in messages."""
         centres = self.low + (np.indices(self.shape).reshape(3, -1).T + 0.5) * self.cell
         return centres.astype(np.float32).astype(float)
 
     def observe(self, depth: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray) -> np.ndarray:
-        """The cells that a view shows surface in.
+        """Find the cells in which a view shows surface.
 
         Args:
             depth: (H, W) metres along z, NaN where invalid.
@@ -94,7 +96,7 @@ class SurfaceGrid:
             (cells,) bool.
 
         Raises:
-            ValueError: the depth image is not of the camera's size.
+            ValueError: the depth image and the camera differ in size.
         """
         if depth.shape != (camera.height, camera.width):
             raise ValueError(f"depth image is {depth.shape}, the camera's are {(camera.height, camera.width)}")
@@ -106,13 +108,13 @@ class SurfaceGrid:
         return _count(along, self.shape) >= _LEAST_POINTS
 
     def _window(self, camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[slice, slice]:
-        """Rows and columns of the thinned image that the box can appear in: all where it reaches behind the camera."""
+        """Rows and columns of the subsampled image that can show the grid; all if it reaches behind the camera."""
         corners = self.low + np.array(list(product((0, 1), repeat=3))) * self.shape * self.cell
         corners = (corners - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
         if corners[:, 2].min() <= 0:
             return slice(None), slice(None)
         stride, pixels = _stride(camera), project(corners, camera)
-        # A pixel of margin for rounding.
+        # One pixel of margin for rounding.
         low = np.maximum(np.floor(pixels.min(axis=0) / stride) - 1, 0).astype(int)
         high = np.maximum(np.ceil(pixels.max(axis=0) / stride) + 2, 0).astype(int)
         return slice(low[1], high[1]), slice(low[0], high[0])
@@ -120,7 +122,7 @@ class SurfaceGrid:
 
 @compiled
 def _count(along: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """(cells,) how many of (3, k) points, in cells from the grid's corner and NaN where invalid, are in each cell."""
+    """(cells,) number of points in each cell, of (3, k) points in units of cells from the corner, NaN where invalid."""
     counts = np.zeros(shape[0] * shape[1] * shape[2], np.int32)
     for index in range(along.shape[1]):
         x, y, z = along[0, index], along[1, index], along[2, index]
@@ -131,7 +133,7 @@ def _count(along: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def _rays(camera: PinholeCamera) -> np.ndarray:
-    """(3, h, w) rays with z = 1 through the pixels of the thinned image."""
+    """(3, h, w) rays with z = 1 through the pixels of the subsampled image."""
     stride = _stride(camera)
     return np.ascontiguousarray(np.moveaxis(pixel_rays(camera)[::stride, ::stride], -1, 0))
 
@@ -141,12 +143,12 @@ def _stride(camera: PinholeCamera) -> int:
 
 
 class Explainer:
-    """Says which points lie on the surface of which pose of an object, from a table of the surface's surroundings.
+    """Decides which points lie near the surface of an object in given poses, by looking them up in a voxel table.
 
     Args:
         model: the object.
-        within: points at most this far from the surface are explained, in diameters; exact to a voxel's half diagonal,
-            2 % of the diameter.
+        within: points at most this far from the surface are explained, in diameters. Exact to half the diagonal of a
+            voxel, 2 % of the diameter.
     """
 
     def __init__(self, model: ObjectModel, within: float) -> None:
@@ -158,13 +160,13 @@ class Explainer:
         scene = ray_caster(model.mesh, threads=1)
         centres = low + (np.indices(shape).reshape(3, -1).T + 0.5) * self._voxel
         near = scene.compute_distance(centres.astype(np.float32), nthreads=1).numpy().reshape(shape) <= reach
-        # What lies outside of the table is looked up in its outermost layer.
+        # Points outside of the table are looked up in its outermost layer.
         self._near = np.zeros(shape, bool)
         self._near[1:-1, 1:-1, 1:-1] = near[1:-1, 1:-1, 1:-1]
-        self.explains(np.zeros((1, 3)), np.eye(4)[None])  # now, so that no view waits for the compiler
+        self.explains(np.zeros((1, 3)), np.eye(4)[None])  # compile now, so that no view has to wait
 
     def explains(self, points: np.ndarray, T_world_object: np.ndarray) -> np.ndarray:
-        """Whether each of (k, 3) points in the world is near the surface of each of (n, 4, 4) poses: (n, k) bool."""
+        """(n, k) bool, whether (k, 3) points are near the surface of the object in (n, 4, 4) poses; world, metres."""
         R = T_world_object[:, :3, :3] / self._voxel
         origin = -np.einsum("ni,nij->nj", T_world_object[:, :3, 3], R) - self._low / self._voxel
         return _look_up(np.ascontiguousarray(np.transpose(points), float), R, origin, self._near)
@@ -172,22 +174,22 @@ class Explainer:
 
 @compiled
 def _look_up(points: np.ndarray, rotation: np.ndarray, origin: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Entries of a table at points that n poses take there.
+    """Look up points in a table, after mapping them into the frames of n poses.
 
     Args:
-        points: (3, k).
-        rotation: (n, 3, 3), transposed, and to the table's units.
-        origin: (n, 3) where the points' origin is in the table.
+        points: (3, k) in the world, metres.
+        rotation: (n, 3, 3) rotations of the poses, divided by the edge of a voxel.
+        origin: (n, 3) the world's origin in each table, voxels.
         table: (nx, ny, nz) bool.
 
     Returns:
-        (n, k) entries, outside of the table its first one.
+        (n, k) entries; the first entry for points outside of the table.
     """
     found, entry = np.empty((len(rotation), points.shape[1]), np.bool_), np.empty(points.shape[1], np.uint32)
     (nx, ny, nz), flat = table.shape, table.ravel()
     for pose in range(len(rotation)):
         R, o = rotation[pose], origin[pose]
-        # Of two loops the first works on several points at once.
+        # Two loops, so that the compiler can use vector instructions in the first one.
         for index in range(points.shape[1]):
             x, y, z = points[0, index], points[1, index], points[2, index]
             i = x * R[0, 0] + y * R[1, 0] + z * R[2, 0] + o[0]
@@ -203,23 +205,23 @@ def _look_up(points: np.ndarray, rotation: np.ndarray, origin: np.ndarray, table
 
 @lru_cache(maxsize=8)
 def explainer(model: ObjectModel, within: float) -> Explainer:
-    """The explainer of an object, made once per process."""
+    """The explainer of an object, computed once per process."""
     return Explainer(model, within)
 
 
 class ObservedSurface:
-    """Accumulates what views show of the surface in the workspace, and says what of it no object explains.
+    """Accumulates the surface that views show in the workspace, and finds the part that no object explains.
 
     Args:
         model: the object.
-        grid: of the workspace; the one over the object's usual bin when None.
+        grid: cells of the workspace; those over the object's usual bin when None.
         within: see :class:`Explainer`.
     """
 
     def __init__(self, model: ObjectModel, grid: SurfaceGrid | None = None, within: float = EXPLAINED_WITHIN) -> None:
         self.grid = grid or SurfaceGrid.for_model(model)
         self._explainer = explainer(model, within)
-        _count(np.zeros((3, 0), np.float32), self.grid.shape)  # now, so that no view waits for the compiler
+        _count(np.zeros((3, 0), np.float32), self.grid.shape)  # compile now, so that no view has to wait
         self.reset()
 
     def reset(self) -> None:
@@ -227,15 +229,15 @@ class ObservedSurface:
         self._seen: dict[int, np.ndarray] = {}
 
     def add_view(self, stamp: int, depth: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray) -> None:
-        """Take in a view, identified by its stamp (ns); arguments as of :meth:`SurfaceGrid.observe`."""
+        """Add a view, identified by its stamp (nanoseconds); other arguments as for :meth:`SurfaceGrid.observe`."""
         self._seen[stamp] = self.grid.observe(depth, camera, T_world_camera)
 
     def forget_before(self, stamp: int) -> None:
-        """Forget the views older than ``stamp`` in nanoseconds."""
+        """Forget all views older than ``stamp`` (nanoseconds)."""
         self._seen = {known: seen for known, seen in self._seen.items() if known >= stamp}
 
     def unexplained(self, T_world_object: np.ndarray) -> np.ndarray:
-        """(k, 3) centres of the cells seen in any view and explained by none of (n, 4, 4) poses, metres."""
+        """(k, 3) centres of the unexplained cells: seen, and not near any of (n, 4, 4) poses; world, metres."""
         seen = np.logical_or.reduce([np.zeros(len(self.grid), bool), *self._seen.values()])
         points = self.grid.centres[seen]
         return points[~self._explainer.explains(points, T_world_object).any(axis=0)]

@@ -1,4 +1,4 @@
-"""The verification score: how well a hypothesis fits the depth inside its own mask (paper, equation 1)."""
+"""The verification score: how well a hypothesis fits the depth image inside its mask (paper, equation 1)."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from active6d_perception.model.model_views import ModelViews, model_views
 
 
 def local_fit(distance: np.ndarray, normal_product: np.ndarray, epsilon: float) -> np.ndarray:
-    """delta(p, q) of equation 1, element by element.
+    """delta(p, q) of equation 1, for arrays of pairs.
 
     Args:
         distance: (...,) ``||p - q||`` in metres.
         normal_product: (...,) ``n_p . n_q`` of unit normals, in [-1, 1].
-        epsilon: metres.
+        epsilon: threshold of the distance, metres.
 
     Returns:
-        (...,) values in [-1/2, 1]; 0 from ``epsilon`` on.
+        (...,) values in [-1/2, 1]; 0 for distances from ``epsilon`` on.
     """
     fit = 0.5 * (1.0 - distance / epsilon) + 0.5 * normal_product
     return np.where(distance < epsilon, fit, 0.0)
@@ -27,10 +27,9 @@ def local_fit(distance: np.ndarray, normal_product: np.ndarray, epsilon: float) 
 class Verifier:
     """Scores hypotheses of one object without ground truth.
 
-    The scene points q are depth pixels inside the hypothesis's mask, evenly taken from it in raster order; p is the
-    nearest point to q on the model as the camera sees it. "As the camera sees it" comes from
-    :class:`.ModelViews`; the sample found there stands for a small disc of surface, so
-    that the distance is to the surface and does not grow with the samples' spacing.
+    The scene points q are depth pixels inside the hypothesis's mask, evenly spaced in raster order. The model point p
+    is the nearest one to q on the surface that the camera sees, see :class:`.ModelViews`. Each sample of the model
+    represents a small disc, so that the distance to the surface does not depend on the spacing of the samples.
     """
 
     def __init__(self, model: ObjectModel, epsilon: float = 0.010, samples: int = 128, reach: int = 3) -> None:
@@ -38,8 +37,8 @@ class Verifier:
         Args:
             model: the object.
             epsilon: threshold of equation 1 in metres.
-            samples: most scene points per mask.
-            reach: pixels each way over which scene normals are measured.
+            samples: largest number of scene points per mask.
+            reach: distance in pixels over which scene normals are measured.
 
         Raises:
             ValueError: a parameter is not positive.
@@ -49,11 +48,11 @@ class Verifier:
                 raise ValueError(f"verification: {name} must be positive, got {value}")
         self.epsilon, self.samples, self.reach = epsilon, samples, reach
         self.views: ModelViews = model_views(model)
-        # Now, so that no view waits for the compiler.
+        # Compile now, so that no view has to wait.
         self.score(np.zeros((1, 1), np.float32), PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0), Hypotheses.empty(1, 1))
 
     def score(self, depth: np.ndarray, camera: PinholeCamera, hypotheses: Hypotheses) -> np.ndarray:
-        """Verification scores c of all hypotheses of a view.
+        """Compute the verification scores c of all hypotheses of a view.
 
         Args:
             depth: (H, W) metres along z, NaN where invalid.
@@ -61,10 +60,10 @@ class Verifier:
             hypotheses: k hypotheses with masks of the same size.
 
         Returns:
-            (k,) mean of delta over all scene points in the mask with valid depth; 0 for a mask without any.
+            (k,) mean of delta over the scene points in the mask; 0 for a mask without valid depth.
 
         Raises:
-            ValueError: the sizes of depth image and masks differ.
+            ValueError: depth image and masks differ in size.
         """
         if depth.shape != hypotheses.segmentation.shape:
             raise ValueError(f"depth image is {depth.shape}, the masks are {hypotheses.segmentation.shape}")
@@ -80,10 +79,10 @@ class Verifier:
         """delta(p, q) per scene point.
 
         Args:
-            points: (n, 3) scene points q in the optical frame.
-            normals: (n, 3) their normals facing the camera, zero where unknown: such a point is judged by its distance.
-            T_camera_object: (k, 4, 4) poses of the hypotheses.
-            owner: (n,) hypothesis that each point is judged by.
+            points: (n, 3) scene points q in the optical frame, metres.
+            normals: (n, 3) their unit normals facing the camera; zero where unknown, so that only the distance counts.
+            T_camera_object: (k, 4, 4) poses of the hypotheses in the optical frame, metres.
+            owner: (n,) index of each point's hypothesis.
 
         Returns:
             (n,) values of equation 1.
@@ -98,7 +97,7 @@ class Verifier:
         """Pixels with depth inside the masks, at most ``samples`` of each, evenly spaced in raster order.
 
         Returns:
-            (n,) flat indices, mask by mask, and (n,) the hypotheses that they belong to.
+            (n,) flat indices, mask by mask, and (n,) indices of their hypotheses.
         """
         height, width = depth.shape
         corners = np.rint(np.clip(np.nan_to_num(hypotheses.box), 0.0, 1.0) * (width, height, width, height)).astype(int)
@@ -109,19 +108,19 @@ class Verifier:
 def points_and_normals(
     depth: np.ndarray, camera: PinholeCamera, pixels: np.ndarray, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Scene points and normals at a few pixels of a depth image; the rest of the image is not touched.
+    """Compute scene points and normals at a few pixels of a depth image; the other pixels cost nothing.
 
-    A tangent is the central difference over ``reach`` pixels each way or, where depth jumps on one side (an
-    occlusion edge) or is missing there, the difference on the other side.
+    A tangent is the central difference over ``reach`` pixels on both sides. If depth is missing on one side or jumps
+    there (an occlusion edge), it is the difference on the other side.
 
     Args:
-        depth: (H, W) metres, NaN invalid.
+        depth: (H, W) metres along z, NaN invalid.
         camera: intrinsics.
         pixels: (n,) flat indices with valid depth.
         reach: pixels.
 
     Returns:
-        (n, 3) points in the optical frame and (n, 3) unit normals facing the camera, zero where both sides are missing.
+        (n, 3) points in the optical frame, metres, and (n, 3) unit normals facing the camera, zero where unknown.
     """
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     return _points_and_normals(np.require(depth, np.float32, ["C", "W"]), intrinsics, np.asarray(pixels), reach)
@@ -134,7 +133,7 @@ _Vector = tuple[float, float, float]
 def _pixels_in_boxes(
     segmentation: np.ndarray, depth: np.ndarray, corners: np.ndarray, label: np.ndarray, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """See :meth:`Verifier.mask_pixels`; ``corners`` (k, 4) are x and y of the boxes' pixels, the last ones excluded."""
+    """See :meth:`Verifier.mask_pixels`; ``corners`` (k, 4) are the boxes in pixels, maxima excluded."""
     width = depth.shape[1]
     pixels, owner = np.empty(len(label) * samples, np.int64), np.empty(len(label) * samples, np.int64)
     inside, total = np.empty(depth.size, np.int64), 0
@@ -143,7 +142,7 @@ def _pixels_in_boxes(
         count = 0
         for y in range(y0, y1):
             for x in range(x0, x1):
-                # Written in any case and kept if it counts: a branch here is slower.
+                # Always written, and overwritten if the pixel does not count: a branch would be slower.
                 inside[count] = y * width + x
                 count += (segmentation[y, x] == label[index]) & np.isfinite(depth[y, x])
         for place in range(min(count, samples)):
@@ -175,7 +174,7 @@ def _points_and_normals(
         nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
         if length > 0:
-            # Facing the camera is against the ray to the point.
+            # A normal that faces the camera points against the ray.
             length = -length if nx * x + ny * y + nz * z > 0 else length
             normals[index, 0], normals[index, 1], normals[index, 2] = nx / length, ny / length, nz / length
     return points, normals
@@ -183,7 +182,7 @@ def _points_and_normals(
 
 @compiled
 def _backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float], u: int, v: int) -> _Vector:
-    """The point of one pixel in the optical frame."""
+    """The point of one pixel in the optical frame, metres."""
     fx, fy, cx, cy = intrinsics
     z = float(depth[v, u])
     return (u - cx) / fx * z, (v - cy) / fy * z, z
@@ -191,9 +190,9 @@ def _backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float
 
 @compiled
 def _tangent(before: _Vector, centre: _Vector, after: _Vector) -> _Vector:
-    """Of a surface at the middle one of three points in line, NaN where it has no neighbour."""
+    """Tangent of the surface at ``centre``, from its neighbours on both sides; NaN without a neighbour."""
     jump_after, jump_before = abs(after[2] - centre[2]), abs(centre[2] - before[2])
-    # A smooth surface changes its slope little within a few pixels; 5 mm between the two sides is an edge.
+    # The slope of a smooth surface changes little within a few pixels; 5 mm between the two sides is an edge.
     smooth = abs(jump_after - jump_before) < 0.005
     if not smooth and (jump_after <= jump_before or np.isnan(jump_before)):
         return after[0] - centre[0], after[1] - centre[1], after[2] - centre[2]
@@ -210,7 +209,7 @@ def _tangent(before: _Vector, centre: _Vector, after: _Vector) -> _Vector:
 def _into_object_frames(
     points: np.ndarray, normals: np.ndarray, T_camera_object: np.ndarray, owner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals (n, 3) of the optical frame in those of the objects at (k, 4, 4), each in its owner's."""
+    """(n, 3) points and normals, mapped from the optical frame into the frame of their owner among (k, 4, 4) poses."""
     q, n_q = np.empty(points.shape), np.empty(points.shape)
     for index in range(len(points)):
         T, point, normal = T_camera_object[owner[index]], points[index], normals[index]
@@ -229,17 +228,17 @@ def _against_discs(
     p: np.ndarray,
     surface: tuple[np.ndarray, np.ndarray, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What equation 1 takes of points and the surface, of which every sample stands for a disc.
+    """Distances and products of normals for equation 1, with each sample of the surface as a disc.
 
     Args:
-        q: (n, 3) points in the object frame.
-        n_q: (n, 3) their normals.
-        distance: (n,) metres from the nearest samples.
-        p: (n,) the nearest samples, -1 where none is near.
-        surface: (s, 3) samples, (s, 3) their normals, and the radius of their discs in metres.
+        q: (n, 3) points in the object frame, metres.
+        n_q: (n, 3) their unit normals.
+        distance: (n,) distances to the nearest samples, metres.
+        p: (n,) indices of the nearest samples, -1 if none is near.
+        surface: (s, 3) samples, (s, 3) their normals, and the radius of their discs, metres.
 
     Returns:
-        (n,) distances to the surface in metres, infinite where no sample is near, and (n,) products of the normals.
+        (n,) distances to the surface, metres, infinite if no sample is near, and (n,) products of the normals.
     """
     points, normals, radius = surface
     to_surface, product = np.full(len(q), np.inf), np.zeros(len(q))
