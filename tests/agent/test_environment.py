@@ -190,7 +190,7 @@ def test_the_vector_environment_is_many_single_ones(lookup):
             np.testing.assert_allclose(values, [result[0][name] for result in alone], atol=1e-7)
     for name in ("detection_rate", "e_add_mm", "distance_m"):
         np.testing.assert_allclose(info[name], [result[4][name] for result in alone])
-    assert (vector.episodes.time == 0).all(), "ended episodes begin anew"
+    assert (vector.episodes.time == 0).all(), "a new episode follows"
 
 
 def test_equal_seeds_give_equal_episodes(lookup):

@@ -1,6 +1,6 @@
 """The deployed fusion on the scenes of a bank, for many episodes at once.
 
-Everything that does not depend on the chosen views is computed once: distances between hypotheses, their components,
+Values that do not depend on the chosen views are computed once: distances between hypotheses, their components,
 and their boxes in every view. The fusion node calls the same :mod:`active6d_perception.scene.clustering`, so results
 equal those of :class:`~active6d_perception.scene.fusion.SceneFusion` for the same views. The surface that a hypothesis
 explains is computed at the first request and kept, see :mod:`active6d_perception.scene.observed_surface`.
@@ -32,7 +32,7 @@ _SIZES = ((2, 2), (3, 4), (5, 8), (9, 16), (17, 32), (33, 10_000))
 
 @dataclass(frozen=True, eq=False)
 class FusedBatch:
-    """What fusion makes of the views of E episodes.
+    """Accumulated objects of E episodes.
 
     Attributes:
         objects: (E, n) rows of the accumulated objects, best first, -1 padding.
@@ -94,7 +94,7 @@ class BatchedFusion:
         return T[order], scene.table[order], scene.view[order], scene.errors[order]
 
     def _nearest_objects(self, scene: BankScene, T_world_object: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """(h,) the true object that each hypothesis is best for: least e_ADD, or nearest if none is in reach."""
+        """(h,) the true object of least e_ADD for each hypothesis, or the nearest one if none is within 50 mm."""
         apart = np.linalg.norm(T_world_object[:, None, :3, 3] - scene.T_world_object[:, :3, 3], axis=-1)
         return np.where(np.isfinite(errors).any(axis=1), errors.argmin(axis=1), apart.argmin(axis=1))
 

@@ -1,10 +1,12 @@
-"""Scene banks: what the deployed estimator and verification said in every view of every scene.
+"""Scene banks: results of the deployed estimator and verification in every view of every scene.
 
 The agent trains and is evaluated on look-ups in a bank, which is thousands of times faster than rendering. A bank is
-one compressed ``.npz`` per object and split, without pickled data: hypotheses as tables, in the camera's frame and in
-float32 as the graph's messages carry them; the true poses; the e_ADD of every hypothesis against every object that it
-is within 50 mm of (all that scoring needs); each view's entropy; and the surface that each view's depth image shows, as
-one bit a cell of a grid over the bin.
+one compressed ``.npz`` per object and split, without pickled data. It holds:
+
+- hypotheses as tables, in the camera's frame and in float32 as in the graph's messages;
+- the true poses, and the e_ADD of every hypothesis against every object within 50 mm;
+- each view's entropy;
+- the surface that each view's depth image shows, one bit for each cell of a grid over the bin.
 """
 
 import json
@@ -82,7 +84,7 @@ def observe_scene(
     sphere: ViewSphere,
     grid: SurfaceGrid,
 ) -> BankScene:
-    """Look at a scene from every view of the grid.
+    """Run estimator and verification on every view of the grid.
 
     Args:
         name: of the scene.
@@ -143,8 +145,8 @@ def build_bank(
 ) -> Iterator[str]:
     """Observe all scenes and write the bank; yields each scene's name as it is done.
 
-    Finished scenes are kept beside ``path`` until the bank is complete, so a run that was interrupted goes on where it
-    stopped, and a bank that is there is only extended; what was made with another ``provenance`` is made again.
+    Finished scenes are kept beside ``path`` until the bank is complete, so an interrupted run continues where it
+    stopped. An existing bank is extended. Scenes of another ``provenance`` are made again.
 
     Args:
         path: of the ``.npz`` to write.
@@ -164,7 +166,7 @@ def build_bank(
     files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes if name not in known}
     missing = [name for name, file in files.items() if not _scenes_of(file, empty)]
     yield from (name for name in scenes if name not in missing)
-    # Spawned, because a forked child inherits locks of threads that do not live on in it (Embree, BLAS).
+    # Spawned, because a forked child inherits locks of threads that do not exist in it (Embree, BLAS).
     pool = ProcessPoolExecutor(max(1, min(workers, len(missing))), mp_context=multiprocessing.get_context("spawn"))
     try:
         running = {pool.submit(_observe_to_file, observe, name, files[name], empty): name for name in missing}
@@ -182,7 +184,7 @@ def build_bank(
 
 
 def _scenes_of(path: Path, like: "SceneBank") -> dict[str, BankScene]:
-    """The scenes of a bank that is whole and was made the same way as ``like``, by name; none otherwise."""
+    """The scenes of a complete bank that was made the same way as ``like``, by name; none otherwise."""
     try:
         bank = load_bank(path)
     except ValueError:
@@ -261,20 +263,20 @@ class SceneBank:
 
 
 def cached_banks() -> Path:
-    """Folder that banks are made in unless another is asked for."""
+    """Default folder of banks that are made here."""
     return cache_folder("banks")
 
 
 def bank_path(folder: Path, object_name: str, split: str, seed: int = 0) -> Path:
-    """Where the bank of an object and split lies in a folder of banks; one of another seed of the noise lies beside."""
+    """Path of the bank of an object and split in a folder of banks; other seeds of the noise have their own files."""
     return folder / f"{object_name}_{split}{f'_seed{seed}' if seed else ''}.npz"
 
 
 def find_bank(object_name: str, split: str, folder: Path | None = None, seed: int = 0) -> Path:
-    """The bank of an object, split and seed in ``folder``; without one, in the cache or else among the shipped ones.
+    """Path of an existing bank in ``folder``; when None, in the cache or else among the shipped ones.
 
     Raises:
-        ValueError: there is none; the message says what makes it.
+        ValueError: there is none; the message has the command that makes it.
     """
     folders = (cached_banks(), SHIPPED_BANKS) if folder is None else (folder,)
     for path in (bank_path(each, object_name, split, seed) for each in folders):
@@ -305,7 +307,7 @@ def load_bank(path: Path) -> SceneBank:
         scenes = [_read_scene(data, index, name) for index, name in enumerate(header["scenes"])]
         return SceneBank(header["object"], sphere, grid, scenes, header["provenance"])
     except Exception as error:  # numpy raises many kinds on damaged archives
-        raise ValueError(f"{path}: not a scene bank ({error}); make it anew with 'active6d bank'") from error
+        raise ValueError(f"{path}: not a scene bank ({error}); make it again with 'active6d bank'") from error
 
 
 def _read_scene(data: dict[str, np.ndarray], index: int, name: str) -> BankScene:

@@ -16,7 +16,7 @@ from active6d_core.metrics import DETECTION_FRACTION
 
 @dataclass(frozen=True)
 class RewardParameters:
-    """Equations 2 to 4, made dimensionless: errors over 10 % of the diameter, distances over the hemisphere's radius.
+    """Equations 2 to 4, dimensionless: errors over 10 % of the diameter, distances over the hemisphere's radius.
 
     Attributes:
         alpha: in [0, 1], weight of getting closer to the attended object.
@@ -42,7 +42,7 @@ class RewardParameters:
             raise ValueError(f"reward: alpha and beta must be in [0, 1], got {self.alpha} and {self.beta}")
 
     def combine(self, error_drop: np.ndarray, approach: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """Equation 4 from the falls of the error and of the distance to the object, and the L1 length of the move."""
+        """Equation 4 from the decrease of error and distance to the object, and the L1 length of the move."""
         sign = -1.0 if self.as_printed else 1.0
         return (
             (1 - self.alpha) * self.error_scale * sign * error_drop
@@ -116,7 +116,7 @@ class Episodes:
         self._errors = self.lookup.object_errors(self.fused)
 
     def move(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Move, look and fuse: (E, 3) actions to (E,) rewards and (E,) whether the episodes are over."""
+        """Take the next views: (E, 3) actions to (E,) rewards and (E,) whether the episodes are over."""
         each = np.arange(len(self.time))
         before, errors, last = self.fused, self._errors, self.current
         view = decode(action[:, :2], self.sphere, self.free)
@@ -138,7 +138,7 @@ class Episodes:
         return reward, self.time == self.steps
 
     def _approach(self, row: np.ndarray, last: np.ndarray, view: np.ndarray) -> np.ndarray:
-        """Equation 3, falling; the attended object is now the accumulated one nearest to its place."""
+        """Decrease of equation 3's distance; the attended object is now the one nearest to its old position."""
         if not self.fused.objects.size:
             return np.zeros(len(row))
         centre = self.lookup.positions[row]

@@ -1,4 +1,4 @@
-"""Episodes on a scene bank, many side by side: what a policy observes, its moves, and the scores of what it saw.
+"""Episodes on a scene bank, many side by side: observations of a policy, its moves, and their scores.
 
 Evaluation and training share these functions; the Gymnasium environment shares the scoring.
 """
@@ -18,7 +18,7 @@ Choose = Callable[[np.ndarray, list[Observation]], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class EpisodeResults:
-    """What E episodes of one policy ended with.
+    """Final results of E episodes of one policy.
 
     Attributes:
         scene: (E,) indices.
@@ -85,7 +85,7 @@ def observe(
     allowed: np.ndarray | None = None,
     metres: float = np.inf,
 ) -> list[Observation]:
-    """What a policy sees after (E, v) views, -1 padding at the end, with (E,) moves left.
+    """Observations of a policy after (E, v) views, -1 padding at the end, with (E,) moves left.
 
     Args:
         lookup: of the bank.
@@ -93,7 +93,7 @@ def observe(
         views: taken so far, at least one.
         left: of the budget.
         allowed: (M,) bool, views in reach, all when None.
-        metres: budget of each episode from its beginning.
+        metres: travel budget of each episode from its beginning.
     """
     allowed = np.ones(len(lookup.sphere), bool) if allowed is None else allowed
     count = (views >= 0).sum(axis=1)

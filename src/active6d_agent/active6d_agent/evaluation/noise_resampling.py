@@ -1,7 +1,7 @@
-"""How much of the greedy oracle's lead is noise: the same views of the same scenes with other noise of the sensor.
+"""The part of the greedy oracle's lead that is noise: the same views of the same scenes with other sensor noise.
 
-A bank holds one image per view, and the oracle chooses by what the estimator made of exactly that image. No planner can
-foresee the noise of an image that it has not taken, so no planner can win the part of the oracle's lead that is noise.
+A bank holds one image per view, and the oracle knows the estimator's result on that image before it takes the view. No
+planner can predict the noise of an image that it has not taken. So a part of the oracle's lead is out of reach.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,11 +28,11 @@ def ablate_noise_resampling(
 ) -> Iterator[dict]:
     """Policies choose their views on either bank; the views are scored on that bank and on the other one.
 
-    Yields a row for each ``policy`` and ``noise``, the mean of both ways round. The noise is "own", that of the images
-    the views were chosen with; "other"; and for the oracle in between "unforeseen": it sees the truth and what its own
-    images gave so far, but weighs the next view by the other bank's image, and gets its own. Rows of other noise are
-    compared with the one of own noise (``against_first``). ``gap_closed`` is the share of the way from Random's
-    detection rate to the oracle's on own noise.
+    Yields a row for each ``policy`` and ``noise``, the mean over both banks. Noise "own" is that of the images that the
+    views were chosen with, "other" that of the other bank. The oracle also has "unforeseen": it knows the truth and the
+    results of its images so far, but predicts the next view by the other bank's image. Rows are compared with the one
+    of own noise (``against_first``). ``gap_closed`` is the share of the way from Random's detection rate to the
+    oracle's on own noise.
 
     Args:
         lookups: of two banks of the same scenes.
@@ -112,10 +112,10 @@ def join_banks(bank: SceneBank, other: SceneBank) -> BatchedFusion:
 
 
 def search_unforeseen(joined: BatchedFusion, starts: np.ndarray, steps: int) -> np.ndarray:
-    """(E, T + 1) views of a greedy search with the truth at hand that cannot foresee the noise of its next image.
+    """(E, T + 1) views of a greedy search that knows the ground truth but not the noise of its next image.
 
     Args:
-        joined: of :func:`join_banks`: images are taken in the first bank and foretold by the second.
+        joined: of :func:`join_banks`: images are taken in the first bank and predicted by the second.
         starts: (E, 2) scenes and first views.
         steps: moves T, fewer than there are views.
     """
@@ -125,7 +125,7 @@ def search_unforeseen(joined: BatchedFusion, starts: np.ndarray, steps: int) -> 
         chosen = []
         for scene, path in zip(starts[:, 0], views, strict=True):
             free = np.setdiff1d(np.arange(M), path)
-            foretold = np.column_stack([np.tile(path, (len(free), 1)), M + free])
-            chosen.append(free[worth(joined, np.full(len(free), scene), foretold).argmax()])
+            predicted = np.column_stack([np.tile(path, (len(free), 1)), M + free])
+            chosen.append(free[worth(joined, np.full(len(free), scene), predicted).argmax()])
         views = np.column_stack([views, chosen])
     return views

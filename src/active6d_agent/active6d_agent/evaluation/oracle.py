@@ -1,4 +1,4 @@
-"""Bounds that see the truth: how much of what could be won a policy has won."""
+"""Upper bounds: searches for views that know the ground truth."""
 
 import numpy as np
 
@@ -10,8 +10,10 @@ _CHUNK = 4096
 
 
 def known(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """(E, o, 2) what is known of every true object after (E, v) views, -1 padding: 1 when it is detected, and
-    1 - e_ADD / 50 mm; zeros beyond a scene's own objects."""
+    """(E, o, 2) for every true object after (E, v) views, -1 padding: 1 if it is detected, and 1 - e_ADD / 50 mm.
+
+    Zeros beyond a scene's own objects.
+    """
     parts = []
     for start in range(0, len(scene), _CHUNK):
         part = slice(start, start + _CHUNK)
@@ -36,7 +38,7 @@ def worth(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.nda
 def search_views(
     lookup: BatchedFusion, scene: int, start: int, steps: int, *, width: int = 1, allowed: np.ndarray | None = None
 ) -> np.ndarray:
-    """The best views that a search with the truth at hand finds: greedy, or with a beam.
+    """The best views that a search with the ground truth finds, greedy or with a beam.
 
     Args:
         lookup: of the bank.
@@ -58,7 +60,7 @@ def search_views(
         if not len(view):
             break
         paths = np.column_stack([beam[parent], view])
-        # The same set of views in another order is the same.
+        # Order does not change the value of a set of views.
         paths = paths[np.unique(np.sort(paths, axis=1), axis=0, return_index=True)[1]]
         value = worth(lookup, np.full(len(paths), scene), paths)
         beam = paths[np.argsort(-value, kind="stable")[:width]]

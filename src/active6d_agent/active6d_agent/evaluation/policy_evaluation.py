@@ -1,4 +1,4 @@
-"""The paper's Table 1 on a bank: every policy from the same starts, with paired intervals and bounds beside them."""
+"""The paper's Table 1 on a bank: every policy and the bounds from the same starts, with paired intervals."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -66,7 +66,7 @@ def run_named(
 
     Args:
         lookup: of the bank.
-        name: of a policy, or one of ``BOUNDS``: ``oracle`` is greedy with the truth at hand, ``all-views`` takes all.
+        name: of a policy, or one of ``BOUNDS``: the greedy ``oracle`` knows the truth, ``all-views`` takes all.
         starts: (E, 2) scenes and first views.
         steps: moves T.
         seed: of the policy's randomness.
@@ -90,7 +90,7 @@ def run_named(
 
 
 def _all_views(lookup: BatchedFusion, starts: np.ndarray) -> EpisodeResults:
-    """Every view of the grid in its order from the first on; each scene is fused once, since order changes nothing."""
+    """Every view of the grid in its order from the first on; fused once for each scene, as order does not matter."""
     grid = np.arange(len(lookup.sphere))
     scenes, inverse = np.unique(starts[:, 0], return_inverse=True)
     once = measure(lookup, scenes, np.tile(grid, (len(scenes), 1)))
@@ -103,13 +103,12 @@ def _all_views(lookup: BatchedFusion, starts: np.ndarray) -> EpisodeResults:
 class Intervals:
     """95 % bootstrap intervals of means over E episodes, by resampling in two ways.
 
-    ``ci95`` draws episodes: what other starts in these very scenes could have given. ``ci95_scenes`` draws whole scenes
-    with all their starts (a cluster bootstrap): what other scenes could have given. The starts of a scene look at the
-    same heap, so they are not independent and say less together than their number suggests; a claim about scenes not
-    seen needs the second interval, which is the wider one. Ten scenes are few for it: expect it to be a tenth or so too
-    narrow still.
+    ``ci95`` draws episodes: the range over other starts in the same scenes. ``ci95_scenes`` draws whole scenes with all
+    their starts (a cluster bootstrap): the range over other scenes. The starts of a scene share one heap, so they are
+    not independent. A claim about unseen scenes needs the second, wider interval. With ten scenes it is still about a
+    tenth too narrow.
 
-    Of two policies from the same starts, give the differences: that pairs them.
+    To compare two policies from the same starts, give the differences, which pairs the episodes.
 
     Args:
         scene: (E,) indices of the episodes' scenes.
@@ -131,8 +130,10 @@ class Intervals:
         return {kind: np.quantile(weight @ values, [0.025, 0.975]).tolist() for kind, weight in self._weights.items()}
 
     def of_ratio(self, part: np.ndarray, whole: np.ndarray) -> dict[str, list[float]]:
-        """Both intervals of the mean of (E,) ``part`` over that of (E,) ``whole``, of which some must be positive;
-        resamples without any are left out."""
+        """Both intervals of the mean of (E,) ``part`` over that of (E,) ``whole``.
+
+        Some of ``whole`` must be positive; resamples without any are left out.
+        """
         table = {}
         for kind, weight in self._weights.items():
             wholes = weight @ whole
@@ -155,7 +156,7 @@ def evaluate(
 
     Args:
         lookup: of the bank.
-        names: of policies and bounds.
+        names: of policies and of bounds.
         steps: moves T.
         starts: (E, 2) scenes and first views.
         seed: of the policies' randomness.
@@ -172,8 +173,10 @@ def evaluate(
 
 
 def describe(measures: dict[str, np.ndarray], intervals: Intervals, first: dict[str, np.ndarray] | None = None) -> dict:
-    """The mean of each measure (E,) as ``name``, with ``name_ci95`` and ``name_ci95_scenes`` (:class:`Intervals`); and
-    ``against_first``, the paired differences to other measures (:func:`compare`), where those are given."""
+    """The mean of each measure (E,) as ``name``, with ``name_ci95`` and ``name_ci95_scenes`` (:class:`Intervals`).
+
+    With ``first``, also ``against_first``: the paired differences to those measures (:func:`compare`).
+    """
     row: dict = {}
     for name, values in measures.items():
         row[name] = float(values.mean())
@@ -182,8 +185,10 @@ def describe(measures: dict[str, np.ndarray], intervals: Intervals, first: dict[
 
 
 def compare(own: dict[str, np.ndarray], other: dict[str, np.ndarray], intervals: Intervals) -> dict[str, dict]:
-    """Paired differences of each measure (E,), positive where ``own`` is higher: ``mean``, both intervals, and whether
-    these exclude zero (``excludes_zero``, ``excludes_zero_scenes``)."""
+    """Paired differences of each measure (E,), positive where ``own`` is higher.
+
+    They are ``mean``, both intervals, and whether these exclude zero (``excludes_zero``, ``excludes_zero_scenes``).
+    """
     table = {}
     for name, values in own.items():
         difference = values - other[name]

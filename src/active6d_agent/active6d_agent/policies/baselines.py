@@ -1,7 +1,7 @@
 """The paper's baselines ("Baseline policies", supplement B) and one heuristic.
 
-All of them keep to the views that :meth:`Observation.candidates` leaves: reachable, not yet visited, affordable; where
-that is none, they stop.
+All of them choose among :meth:`Observation.candidates`: views in reach, not visited, within the budget. Without a
+candidate they stop.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.special import softmax
 from active6d_agent.policies.registry import Decision, Observation, register_policy
 from active6d_core.object_model import ObjectModel
 
-#: A hypothesis closer to the attended one than this fraction of the diameter is the same object, so it hides nothing.
+#: A hypothesis within this fraction of the diameter of the attended one is the same object, so it hides nothing.
 _SAME_OBJECT = 0.25
 _ATTENTION_TEMPERATURE = 0.1
 
@@ -63,7 +63,7 @@ class RandomPolicy:
 class UnidirectionalPolicy:
     """One revolution at a fixed elevation: T + 1 views 360 / (T + 1) degrees apart, counter-clockwise.
 
-    The first is where the camera starts, whatever its elevation; the others lie on the ring. On the ring from the
+    The first view is the camera's start, at any elevation; the others lie on the ring. On the ring from the
     start, T = 5 measures 2.89 m (the paper prints 2.88).
 
     Args:
@@ -116,12 +116,12 @@ class MaxDistancePolicy:
 
 @register_policy("lowest-score")
 class LowestScorePolicy:
-    """Attend to the object with the lowest verification score and move to where it should be seen best.
+    """Attends to the object with the lowest verification score and moves to the view that should show it best.
 
-    A view is worth the sine of its elevation seen from the object (walls and objects that nobody has seen yet hide
-    things from the side), plus how new its direction is to the object (a quarter turn from all earlier ones is new),
-    plus how free the line of sight is past the known objects, each taken for a ball; less the way there. Without any
-    object it does as ``max-distance``.
+    The worth of a view has four terms. The first is the sine of its elevation seen from the object, because walls and
+    unknown objects hide things from the side. Novelty is the angle to the nearest earlier direction, at most a quarter
+    turn. Sight is how free the line of sight is past the other objects, each modelled as a ball. The length of the
+    move is subtracted. Without any object the policy does as ``max-distance``.
 
     Args:
         model: its diameter is the size of the balls.
@@ -150,7 +150,7 @@ class LowestScorePolicy:
         """Nothing is random here."""
 
     def decide(self, observation: Observation) -> Decision:
-        """The view that should show the least certain object best."""
+        """The view of highest worth for the least certain object."""
         objects, sphere = observation.objects, observation.sphere
         if not len(objects):
             return self._explore.decide(observation)
@@ -169,7 +169,7 @@ class LowestScorePolicy:
 
 @register_policy("single-view")
 class SingleViewPolicy:
-    """Never moves: what the first view gives (T = 0).
+    """Never moves, so that only the first view counts (T = 0).
 
     Args:
         model: unused.
@@ -190,8 +190,8 @@ class SingleViewPolicy:
 class EntropyPolicy:
     """The candidate with the largest view entropy, computed beforehand for every view of this scene.
 
-    That makes it a bound rather than a policy for a robot, which does not know views that it has not taken: a baseline
-    for scenes in a bank (paper, "Entropy-based").
+    A robot does not know the entropy of views that it has not taken. So this is a baseline for scenes in a bank (paper,
+    "Entropy-based").
 
     Args:
         model: unused.
@@ -217,12 +217,12 @@ class EntropyPolicy:
 def line_of_sight(centres: np.ndarray, index: int, views: np.ndarray, diameter: float) -> np.ndarray:
     """How free (M,) views see one of n objects past the others: 1 free, 0 hidden.
 
-    Another object in front of the ray hides linearly less of this one the farther it is from the ray, nothing from one
-    ``diameter`` on; several multiply.
+    Another object in front of this one hides linearly less of it with its distance from the ray, nothing from one
+    ``diameter`` on. Several objects multiply.
 
     Args:
         centres: (n, 3) object centres, world, metres.
-        index: of the object that is looked at.
+        index: of the observed object.
         views: (M, 3) camera positions.
         diameter: of an object.
     """

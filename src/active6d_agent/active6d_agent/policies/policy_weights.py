@@ -27,7 +27,7 @@ def load_weights(path: Path, policy: str, build: Callable[[dict], _Module], reme
     Args:
         path: of the ``.safetensors``.
         policy: whose weights they must be.
-        build: configuration to a module of that shape; may raise what it likes.
+        build: configuration to a module of that shape; may raise any exception.
         remedy: how such weights are made; by default the command that trains the policy.
 
     Raises:

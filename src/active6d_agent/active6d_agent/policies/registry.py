@@ -1,8 +1,8 @@
-"""What a policy sees, what it decides, and how policies are found by name.
+"""The interface of policies: their observation, their decision, and their registry by name.
 
-A policy needs nothing that a robot does not have: the fused objects and the surface that is of none of them, where the
-camera has been, which views it may take, and what is left of its budget (paper, "Problem definition"). The node, the
-environment and the evaluation all speak to policies through this module.
+A policy uses only what a robot knows: the fused objects, the unexplained surface, the camera's positions, the views in
+reach, and the budget left (paper, "Problem definition"). Node, training and evaluation use policies through this
+module.
 """
 
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from active6d_core.object_model import ObjectModel, find_beside
 from active6d_core.registry import Registry
 from active6d_core.view_sphere import ViewSphere
 
-#: Trained policies that come with this package.
+#: Weights of the trained policies that this package contains.
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
 #: Learned policies look at this many objects at most.
 MAX_OBJECTS = 64
@@ -34,9 +34,9 @@ class Observation:
         sphere: the grid of views.
         allowed: (M,) bool, views of the grid that the camera can reach.
         steps_left: moves left, at least 1.
-        metres_left: arc left on the sphere, ``inf`` without such a budget.
-        unexplained: (k, 3) places of the surface that depth images have shown and that is of none of the objects,
-            metres in the world.
+        metres_left: arc left on the sphere, ``inf`` without a travel budget.
+        unexplained: (k, 3) points of unexplained surface, which depth images have shown and no accumulated object
+            explains; metres in the world.
     """
 
     objects: SceneObjects
@@ -68,13 +68,13 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """Where the camera should go, and why.
+    """The next view, and the object that it is for.
 
     Attributes:
         position: (3,) goal on the sphere in the world, metres; the current position when stopping.
         view: index of the goal in the grid, None when it lies off the grid or the episode stops.
         attention: (n,) weight of each object, summing to one (for n > 0).
-        attended: index of the object that the move is for, None when the policy looks at no one object.
+        attended: index of the object that the move is for, None when the policy attends to no single object.
         stop: end the episode here instead of moving.
     """
 
@@ -110,12 +110,12 @@ class Policy(Protocol):
 
 
 def weights_path(policy: str, object_name: str) -> Path:
-    """Where weights of a policy for an object are, or would be: beside its description, or where shipped ones are."""
+    """Path of a policy's weights for an object: beside the object's description, or among the shipped ones."""
     return find_beside(f"{policy}_{object_name}.safetensors", SHIPPED_WEIGHTS)
 
 
 def choose_policy(object_name: str) -> str:
-    """What ``auto`` stands for: the learned policy where there are weights, else the rule that finds most."""
+    """What ``auto`` stands for: the learned policy where there are weights, else the best baseline."""
     return "view-attention" if weights_path("view-attention", object_name).is_file() else "unidirectional"
 
 

@@ -16,14 +16,14 @@ from active6d_agent.policies.policy_weights import load_weights, save_weights
 from active6d_agent.policies.registry import Decision, Observation, register_policy, weights_path
 from active6d_core.object_model import ObjectModel
 
-#: What a state consists of beside the history: o_t (12) and the camera's position (3).
+#: Numbers of a state without the history: o_t (12) and the camera's position (3).
 _STATE = 15
 #: How the attended object is chosen.
 ATTENTION_RULES = ("learned", "lowest-score")
 
 
 class ObjectAttention(nn.Module):
-    """Algorithm 1: which object to reason about.
+    """Algorithm 1: attends to one object.
 
     g^i = FC(b^i, d^i, c^i); w^i = Selector(g^i, mean g); the object with the highest softmax weight m is attended, and
     o_t = (g^m times its weight, b^m, d^m, c^m). The choice is hard; gradients reach FC and Selector through g^m and
@@ -121,7 +121,7 @@ def load_network(path: Path) -> AttentionNetwork:
 
 @register_policy("attention")
 class AttentionPolicy:
-    """The trained network, always at the mean of its Gaussian.
+    """The trained network; always takes the mean of its Gaussian.
 
     Args:
         model: names the shipped weights.

@@ -49,9 +49,9 @@ class PpoParameters:
         batch: minibatch (paper: "number of batches 128").
         epochs: passes over each rollout.
         entropy: weight of the entropy bonus.
-        seed: of everything.
+        seed: of the weights, the episodes and the batches.
         evaluate_every: environment steps between evaluations on the validation scenes.
-        attend: which object, see :class:`~active6d_agent.policies.attention.network.ObjectAttention`.
+        attend: rule for the attended object, see :class:`~active6d_agent.policies.attention.network.ObjectAttention`.
 
     Raises:
         ValueError: a value is out of range.
@@ -205,7 +205,7 @@ class PaperPolicy(ActorCriticPolicy):
 
 @dataclass(frozen=True)
 class Progress:
-    """One line of the curve.
+    """One line of the learning curve.
 
     Attributes:
         steps: environment steps so far.
@@ -236,7 +236,7 @@ def train_ppo(
     """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
 
     ``folder`` receives ``curve.jsonl``, ``best.safetensors`` with its JSON (highest validation detection rate, lower
-    e_ADD of equals), and ``latest.safetensors`` with ``latest.json`` to go on from.
+    e_ADD of equals), and ``latest.safetensors`` with ``latest.json`` to continue from.
 
     Args:
         train: scenes to train on.
@@ -244,7 +244,7 @@ def train_ppo(
         folder: of the results.
         parameters: how to train.
         reward: weights and scales of the reward.
-        resume: go on from ``latest``; the parameters must be those of before, ``total`` excepted.
+        resume: continue from ``latest``; all parameters but ``total`` must be the same as before.
 
     Raises:
         ValueError: there is nothing to resume from, or with other parameters.
@@ -335,6 +335,6 @@ def _restore(ppo: PPO, folder: Path, identity: dict) -> tuple[tuple[float, float
             adam.setdefault(int(index), {})[name] = value
     ppo.policy.optimizer.load_state_dict({**ppo.policy.optimizer.state_dict(), "state": adam})
     ppo.num_timesteps = int(state["steps"])
-    # The same scenes again would be the seed's; go on with others.
+    # The seed alone would draw the same scenes again.
     ppo.set_random_seed(ppo.seed + ppo.num_timesteps)
     return tuple(state["best"]), float(state["seconds"])
