@@ -21,7 +21,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.ros.episode_messages import GoalState, GoalStatus, goal_status_to_message
+from active6d_core.ros.episode_messages import GoalState, GoalStatus
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
 from active6d_core.se3 import make_transform
@@ -83,7 +83,7 @@ class StubCameraNode(GraphNode):
             self._answer(stamp, GoalState.REACHED)
 
     def _answer(self, stamp: int, state: GoalState, reason: str = "") -> None:
-        self._status.publish(goal_status_to_message(GoalStatus(stamp, state, reason), self.world_frame))
+        self._status.publish(GoalStatus(stamp, self.world_frame, state, reason).to_message())
 
     def _stamp(self) -> int:
         return 10**9 + self._count * 500_000_000

@@ -25,7 +25,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose,
 )
-from active6d_core.ros.episode_messages import GoalState, GoalStatus, goal_status_to_message
+from active6d_core.ros.episode_messages import GoalState, GoalStatus
 from active6d_core.view_sphere import ViewSphere
 
 SPHERE = ViewSphere()
@@ -171,7 +171,7 @@ def test_metres_are_a_budget(episode):
 
 def answer(played, state, reason=""):
     """The camera's answer to the goal of the last view."""
-    message = goal_status_to_message(GoalStatus(played.stamp, state, reason), "world")
+    message = GoalStatus(played.stamp, "world", state, reason).to_message()
     played.graph.publish("view_goal/status", message, latched=True)
 
 
@@ -208,7 +208,7 @@ def test_answers_to_other_goals_are_ignored(episode):
     played = episode()
     played.view(10)
     played.graph.spin_until(lambda: len(played.goals) == 1)
-    answered = goal_status_to_message(GoalStatus(played.stamp + 1, GoalState.REFUSED, "another policy's"), "world")
+    answered = GoalStatus(played.stamp + 1, "world", GoalState.REFUSED, "another policy's").to_message()
     played.graph.publish("view_goal/status", answered, latched=True)
     played.graph.spin_for(0.3)
     assert len(played.goals) == 1
@@ -257,10 +257,10 @@ def test_an_announced_episode_may_wait_for_its_first_view(episode):
 
 def test_a_status_that_cannot_be_read_is_refused(episode):
     played = episode()
-    message = goal_status_to_message(GoalStatus(SECOND, GoalState.REFUSED), "world")
+    message = GoalStatus(SECOND, "world", GoalState.REFUSED).to_message()
     message.status[0].values[0].value = "bored"
     played.graph.publish("view_goal/status", message, latched=True)
-    played.graph.spin_until(lambda: any("the state 'bored'" in error for error in played.errors()))
+    played.graph.spin_until(lambda: any("goal state is 'bored'" in error for error in played.errors()))
 
 
 def wrong_frame(cloud):

@@ -13,7 +13,7 @@ from active6d_bringup.bags.replay import ReplaySettings, replay
 from active6d_bringup.bags.writer import CONTRACT, TYPESTORE, RecordingError
 from active6d_bringup.graph.composition import NODES, GraphDescription
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, EpisodeSettings, describe, run_episode
-from active6d_core.ros.episode_messages import goal_status_from_message
+from active6d_core.ros.episode_messages import GoalStatus
 
 
 @pytest.fixture(autouse=True)
@@ -122,7 +122,7 @@ def goals_and_statuses(folder):
             if connection.topic == "/view_goal":
                 goals.append(TYPESTORE.deserialize_cdr(payload, connection.msgtype))
             if connection.topic == "/view_goal/status":
-                statuses.append(goal_status_from_message(TYPESTORE.deserialize_cdr(payload, connection.msgtype)))
+                statuses.append(GoalStatus.from_message(TYPESTORE.deserialize_cdr(payload, connection.msgtype)))
     return goals, statuses
 
 

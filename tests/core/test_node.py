@@ -23,8 +23,9 @@ from std_msgs.msg import String
 
 from active6d_core.ros.conversions import MessageError, OutdatedError, depth_to_image, image_to_depth, stamp_to_ns
 from active6d_core.ros.heartbeat import Awaited, Watch
-from active6d_core.ros.node import GraphNode, StampSynchronizer
+from active6d_core.ros.node import GraphNode
 from active6d_core.ros.parameters import describe_limits
+from active6d_core.ros.synchronizer import StampSynchronizer
 
 
 class DepthNode(GraphNode):

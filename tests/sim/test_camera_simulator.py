@@ -21,7 +21,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.ros.episode_messages import GoalState, GoalStatus, goal_status_from_message
+from active6d_core.ros.episode_messages import GoalState, GoalStatus
 from active6d_core.se3 import look_at
 from active6d_sim.nodes.camera_simulator import CameraSimulatorNode
 from active6d_sim.rendering.sensor import SensorNoise
@@ -84,7 +84,7 @@ class Watched:
         return [stamp_to_ns(message.header.stamp) for message in self.boxes[topic]]
 
     def statuses(self):
-        return [goal_status_from_message(message) for message in self.answers]
+        return [GoalStatus.from_message(message) for message in self.answers]
 
     def errors(self):
         return [d.status[0].message for d in self.diagnostics if d.status[0].level == DiagnosticStatus.ERROR]
@@ -210,7 +210,9 @@ def test_every_goal_is_answered_with_its_own_stamp(watched):
     watched.wait(3)
     watched.graph.spin_until(lambda: len(watched.answers) == 4)
     expected = [
-        GoalStatus(stamp, state) for stamp in watched.stamps()[:2] for state in (GoalState.ACCEPTED, GoalState.REACHED)
+        GoalStatus(stamp, "world", state)
+        for stamp in watched.stamps()[:2]
+        for state in (GoalState.ACCEPTED, GoalState.REACHED)
     ]
     assert watched.statuses() == expected
 

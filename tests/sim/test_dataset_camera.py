@@ -17,7 +17,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.ros.episode_messages import GoalState, goal_status_from_message
+from active6d_core.ros.episode_messages import GoalState, GoalStatus
 from active6d_core.se3 import look_at
 from active6d_sim.datasets.bop import write_bop_scene
 from active6d_sim.nodes.dataset_camera import DatasetCameraNode
@@ -139,7 +139,7 @@ def test_bad_goals_are_refused_and_the_camera_stays(graph, folder):
     ):
         watched.goal(**goal)
         graph.spin_until(lambda number=number: len(watched.answers) == number, what=reason)
-        answer = goal_status_from_message(watched.answers[-1])
+        answer = GoalStatus.from_message(watched.answers[-1])
         assert answer.state == GoalState.REFUSED
         assert reason in answer.reason
     message = transform_to_pose_stamped(SPHERE.pose(SPHERE.positions[45]), 0, "world")
@@ -158,7 +158,7 @@ def test_an_image_that_broke_is_reported_and_the_camera_stays(graph, folder, rec
     graph.spin_until(watched.errors)
     assert "depth/000001.png: not a readable image" in watched.errors()[0]
     graph.spin_until(lambda: len(watched.answers) == 2)
-    states = [goal_status_from_message(message).state for message in watched.answers]
+    states = [GoalStatus.from_message(message).state for message in watched.answers]
     assert states == [GoalState.ACCEPTED, GoalState.REFUSED]
     watched.goal(200.0, stamp=SECOND)  # not stale: nothing has moved
     watched.wait(2)

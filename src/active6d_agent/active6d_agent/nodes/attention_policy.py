@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 
@@ -22,7 +22,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose,
 )
-from active6d_core.ros.episode_messages import GoalState, goal_status_from_message
+from active6d_core.ros.episode_messages import EpisodeEnd, GoalState, GoalStatus
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
@@ -194,7 +194,7 @@ class AttentionPolicyNode(GraphNode):
                 summary.append(f"{len(view['objects'])} objects, {len(self._episode.positions)} views so far")
 
     def _on_status(self, message: DiagnosticArray) -> None:
-        status = goal_status_from_message(message)
+        status = GoalStatus.from_message(message, self.world_frame)
         if not self._is_latest(status.stamp):
             return
         if status.state == GoalState.REACHED:
@@ -240,9 +240,7 @@ class AttentionPolicyNode(GraphNode):
             "moves": str(moves),
             "metres": f"{travelled:.6f}",
         }
-        status = DiagnosticStatus(level=DiagnosticStatus.OK, name="episode", message=reason, hardware_id="active6d")
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        self._publish(self.end, DiagnosticArray(header=make_header(stamp, self.world_frame), status=[status]))
+        self._publish(self.end, EpisodeEnd(stamp, self.world_frame, reason, values).to_message())
         self.get_logger().info(f"episode ended after {moves} moves and {travelled:.2f} m: {reason}")
 
     def _publish(self, publisher, message) -> None:

@@ -4,14 +4,15 @@ from collections import defaultdict
 from importlib import import_module
 from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
 from active6d_bringup.bags.reader import BagError, open_bag, topic_names
 from active6d_bringup.bags.writer import CAMERA_TOPICS, CONTRACT, END, stamp_of
 from active6d_core.ros.clock_output import ClockOutput
-from active6d_core.ros.conversions import make_header, stamp_to_ns
+from active6d_core.ros.conversions import stamp_to_ns
+from active6d_core.ros.episode_messages import EpisodeEnd
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
@@ -82,8 +83,7 @@ class BagPlayerNode(GraphNode):
     def _publish_next(self) -> None:
         self.teardown()
         if self._next == len(self._stamps):
-            status = DiagnosticStatus(level=DiagnosticStatus.OK, name="episode", message="end of the bag")
-            self._end.publish(DiagnosticArray(header=make_header(self._stamps[-1], self.world_frame), status=[status]))
+            self._end.publish(EpisodeEnd(self._stamps[-1], self.world_frame, "end of the bag").to_message())
             self._next += 1
             self.get_logger().info("episode ended: end of the bag")
             return

@@ -1,17 +1,72 @@
-"""Messages about an episode, as standard diagnostics: the camera's answers to view goals."""
+"""Messages about episodes and goals, as dataclasses: the start and the end of an episode, the answer to a goal.
 
-from dataclasses import dataclass
+On the wire all of them are a DiagnosticArray with one status. They need its class, but no rclpy, and read the message
+objects of rosbags as well.
+"""
+
+from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from active6d_core.ros.conversions import HARDWARE_ID, MessageError, make_header, stamp_to_ns
 
-_GOAL = "view_goal"
+
+@dataclass(frozen=True)
+class EpisodeStart:
+    """``episode/start``: a camera begins an episode.
+
+    Attributes:
+        stamp: of the first view, nanoseconds.
+        frame: name of the world's frame.
+        info: what is in the bin: ``object``, ``scene``, ``seed``, ``start_view``, as far as the camera knows.
+    """
+
+    stamp: int
+    frame: str
+    info: dict[str, str] = field(default_factory=dict)
+
+    def to_message(self) -> DiagnosticArray:
+        """The message to publish."""
+        text = f"episode in {self.info['scene']}" if self.info.get("scene") else "episode"
+        return _to_message(self.stamp, self.frame, _status("episode", text, self.info, hardware_id=""))
+
+    @classmethod
+    def from_message(cls, message: Any) -> "EpisodeStart":
+        """Read a message; one without a status has no information."""
+        return cls(stamp_to_ns(message.header.stamp), message.header.frame_id, _values(message))
+
+
+@dataclass(frozen=True)
+class EpisodeEnd:
+    """``episode/end``: no goal follows.
+
+    Attributes:
+        stamp: of the last view, nanoseconds.
+        frame: name of the world's frame.
+        reason: why the episode ended, in words.
+        info: ``policy``, ``seed``, ``moves`` and ``metres``, as far as the publisher knows.
+    """
+
+    stamp: int
+    frame: str
+    reason: str
+    info: dict[str, str] = field(default_factory=dict)
+
+    def to_message(self) -> DiagnosticArray:
+        """The message to publish."""
+        return _to_message(self.stamp, self.frame, _status("episode", self.reason, self.info))
+
+    @classmethod
+    def from_message(cls, message: Any) -> "EpisodeEnd":
+        """Read a message; one without a status has no reason."""
+        reason = message.status[0].message if message.status else ""
+        return cls(stamp_to_ns(message.header.stamp), message.header.frame_id, reason, _values(message))
 
 
 class GoalState(Enum):
-    """What a camera answers to a view goal."""
+    """What became of a goal."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -20,37 +75,54 @@ class GoalState(Enum):
 
 @dataclass(frozen=True)
 class GoalStatus:
-    """A camera's answer to a view goal.
+    """``view_goal/status``: a camera's answer to a goal.
 
     Attributes:
-        stamp: of the goal, in nanoseconds.
-        state: the answer.
-        reason: why it is refused, empty otherwise.
+        stamp: of the goal, nanoseconds.
+        frame: name of the world's frame.
+        state: accepted, refused or reached.
+        reason: why, in words; empty if there is nothing to say.
     """
 
     stamp: int
+    frame: str
     state: GoalState
     reason: str = ""
 
+    def to_message(self) -> DiagnosticArray:
+        """The message to publish; a refusal has the level WARN."""
+        level = DiagnosticStatus.WARN if self.state is GoalState.REFUSED else DiagnosticStatus.OK
+        status = _status("view_goal", self.reason, {"state": self.state.value}, level)
+        return _to_message(self.stamp, self.frame, status)
 
-def goal_status_to_message(status: GoalStatus, frame: str) -> DiagnosticArray:
-    """An answer to a goal in ``frame`` as a message of ``view_goal/status``."""
-    level = DiagnosticStatus.WARN if status.state == GoalState.REFUSED else DiagnosticStatus.OK
-    report = DiagnosticStatus(level=level, name=_GOAL, message=status.reason, hardware_id=HARDWARE_ID)
-    report.values = [KeyValue(key="state", value=status.state.value)]
-    return DiagnosticArray(header=make_header(status.stamp, frame), status=[report])
+    @classmethod
+    def from_message(cls, message: Any, frame: str | None = None) -> "GoalStatus":
+        """Read a message; ``frame`` is what it must be in, None for any.
+
+        Raises:
+            MessageError: another frame, or no known state.
+        """
+        if frame is not None and message.header.frame_id != frame:
+            raise MessageError(f"frame_id is '{message.header.frame_id}', expected '{frame}'")
+        state = _values(message).get("state", "")
+        if state not in (known.value for known in GoalState):
+            known = ", ".join(state.value for state in GoalState)
+            raise MessageError(f"goal state is '{state}', expected one of {known}")
+        stamp = stamp_to_ns(message.header.stamp)
+        return cls(stamp, message.header.frame_id, GoalState(state), message.status[0].message)
 
 
-def goal_status_from_message(message: DiagnosticArray) -> GoalStatus:
-    """A message of ``view_goal/status`` to the answer.
+def _status(
+    name: str, text: str, values: dict[str, str], level: bytes = DiagnosticStatus.OK, hardware_id: str = HARDWARE_ID
+) -> DiagnosticStatus:
+    status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=hardware_id)
+    status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+    return status
 
-    Raises:
-        MessageError: it holds no status of a goal, or an unknown state.
-    """
-    reports = [status for status in message.status if status.name == _GOAL]
-    if len(reports) != 1:
-        raise MessageError(f"view_goal/status holds {len(reports)} statuses named '{_GOAL}', expected one")
-    state = {pair.key: pair.value for pair in reports[0].values}.get("state", "")
-    if state not in [known.value for known in GoalState]:
-        raise MessageError(f"view_goal/status has the state '{state}', expected accepted, refused or reached")
-    return GoalStatus(stamp_to_ns(message.header.stamp), GoalState(state), reports[0].message)
+
+def _to_message(stamp: int, frame: str, status: DiagnosticStatus) -> DiagnosticArray:
+    return DiagnosticArray(header=make_header(stamp, frame), status=[status])
+
+
+def _values(message: Any) -> dict[str, str]:
+    return {pair.key: pair.value for status in message.status for pair in status.values}

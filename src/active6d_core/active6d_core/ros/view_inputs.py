@@ -18,7 +18,8 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
 )
 from active6d_core.ros.heartbeat import Awaited
-from active6d_core.ros.node import GraphNode, StampSynchronizer
+from active6d_core.ros.node import GraphNode
+from active6d_core.ros.synchronizer import StampSynchronizer
 from active6d_core.ros.transform_input import TransformInput
 
 # part of a view: (message type, topic, reader)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseStamped
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
@@ -18,13 +18,12 @@ from active6d_core.ros.conversions import (
     camera_to_info,
     color_to_image,
     depth_to_image,
-    make_header,
     pose_stamped_to_transform,
     poses_to_array,
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.ros.episode_messages import GoalState, GoalStatus, goal_status_to_message
+from active6d_core.ros.episode_messages import EpisodeStart, GoalState, GoalStatus
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.optional_outputs import TransformOutput
@@ -143,9 +142,7 @@ class MovingCameraNode(GraphNode):
     def _announce(self, start: int) -> None:
         values = {"object": self.object_name, "scene": self.scene_name}
         values |= {"seed": str(self.seed), "start_view": str(start)}
-        status = DiagnosticStatus(level=DiagnosticStatus.OK, name="episode", message=f"episode in {self.scene_name}")
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        self._start.publish(DiagnosticArray(header=make_header(self._stamp, self.world_frame), status=[status]))
+        self._start.publish(EpisodeStart(self._stamp, self.world_frame, values).to_message())
         T_world_object = self.truth(start)
         if T_world_object is not None:
             self._truth.publish(poses_to_array(T_world_object, self._stamp, self.world_frame))
@@ -173,7 +170,7 @@ class MovingCameraNode(GraphNode):
             raise MessageError(str(error)) from error
 
     def _answer(self, stamp: int, state: GoalState, reason: str = "") -> None:
-        self._status.publish(goal_status_to_message(GoalStatus(stamp, state, reason), self.world_frame))
+        self._status.publish(GoalStatus(stamp, self.world_frame, state, reason).to_message())
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """A new episode in the same scene."""
