@@ -148,7 +148,7 @@ def test_page_without_truth_objects_or_diagnostics():
     bare = [RecordedStep(step.view) for step in record.steps[:1]]
     page = Page(render_html(analyse(EpisodeRecord(record.folder, record.info, bare, None, None, "world"))))
     assert "no ground truth" in page.text
-    assert "the recording was cut off" in page.text
+    assert "the recording ended before the episode" in page.text
     assert "no diagnostics" in page.text
     assert "no object yet" in page.text
     assert "ADD mm" not in page.text

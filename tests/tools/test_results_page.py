@@ -185,7 +185,7 @@ def test_a_damaged_file_and_an_unknown_block_are_named(tmp_path):
     broken = tmp_path / page.JOBS["steps"].report("mug")
     broken.parent.mkdir(parents=True)
     broken.write_text("{")
-    with pytest.raises(ValueError, match=r"steps_mug\.json: no report"):
+    with pytest.raises(ValueError, match=r"steps_mug\.json: damaged result"):
         page.read_reports(tmp_path)
     with pytest.raises(ValueError, match="has a block 'weather'"):
         page.fill("<!-- results: weather -->\n<!-- end -->", {})

@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
 """Compare ways to decode poses from one trained network, on views of the validation split.
 
-Usage: python -m active6d_tools.studies.compare_decodings OBJECT WEIGHTS SHARD.npz ... [--every N]
+The shards are the views that 'active6d train estimator' renders for validation. All weights and shards of the example
+belong to the coffee cup.
 
-The shards are those that 'active6d train estimator' renders for validation
-(~/.cache/active6d/training/OBJECT/validation/*.npz).
+Example: python -m active6d_tools.studies.compare_decodings coffee_cup
+    src/active6d_perception/active6d_perception/estimators/dense/weights/coffee_cup.safetensors
+    ~/.cache/active6d/training/coffee_cup/validation/*.npz
 """
 
 from rich.console import Console
@@ -14,7 +16,7 @@ from rich.table import Table
 from active6d_perception.estimators.dense.decoding import DecodingParameters
 from active6d_perception.estimators.dense.dense_estimator import DenseParameters
 from active6d_perception.estimators.dense.training.validation import pose_rates
-from active6d_tools.studies.shard_arguments import read_arguments
+from active6d_tools.studies.arguments import read_arguments
 
 DESIGNS = {
     "axes": DenseParameters(),
@@ -24,7 +26,7 @@ DESIGNS = {
 
 
 def main() -> None:
-    model, trained, samples = read_arguments(__doc__.splitlines()[0], every=1)
+    model, trained, samples = read_arguments(__doc__, every=1)
     rates = {
         name: pose_rates(model, trained, samples, parameters)
         for name, parameters in track(DESIGNS.items(), description=f"{len(samples)} views")

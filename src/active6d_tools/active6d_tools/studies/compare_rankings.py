@@ -1,10 +1,8 @@
 #!/usr/bin/env python3
-"""Compare what fusion may rank hypotheses by, on random walks through the validation scenes.
+"""Compare the scores that fusion can rank hypotheses by, on random walks through the validation scenes.
 
-Usage: python -m active6d_tools.studies.compare_rankings OBJECT [--views N] [--walks N]
+Example: python -m active6d_tools.studies.compare_rankings mug --views 6 --walks 2
 """
-
-import argparse
 
 import numpy as np
 from rich.console import Console
@@ -20,11 +18,11 @@ from active6d_perception.scene.fusion import RANKINGS, FusionParameters, SceneFu
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import SPLITS, load_scene
+from active6d_tools.studies.arguments import study_parser
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("object")
+    parser = study_parser(__doc__)
     parser.add_argument("--views", type=int, default=6, help="views fused in each walk")
     parser.add_argument("--walks", type=int, default=2, help="walks in each scene, which have no view in common")
     arguments = parser.parse_args()
@@ -49,7 +47,7 @@ def main() -> None:
                 objects = fusion.objects(*walk[-1][:2], DEFAULT_CAMERA)
                 score = evaluate_scene(model, objects.T_world_object, scene.T_world_object)
                 results[ranking].append((score.detection_rate, score.mean_e_add_mm))
-    table = Table("rank_by", "detection rate", "e_ADD, mm", title=f"{model.name}, {len(results[RANKINGS[0]])} walks")
+    table = Table("rank_by", "detection rate", "ADD, mm", title=f"{model.name}, {len(results[RANKINGS[0]])} walks")
     for ranking, values in results.items():
         detection, error = np.mean(values, axis=0)
         table.add_row(ranking, f"{detection:.3f}", f"{error:.2f}")

@@ -1,12 +1,11 @@
 #!/usr/bin/env python3
-"""Time one network in several runtimes and precisions, on one view of a stored scene, and compare their answers.
+"""Time one network in several runtimes and precisions, on one view of a stored scene, and compare the outputs.
 
-Usage: python -m active6d_tools.studies.compare_runtimes OBJECT [--threads N] [--repeats N]
+ONNX Runtime and OpenVINO are measured if they are installed: pip install onnx onnxruntime openvino
 
-ONNX Runtime and OpenVINO take part where they are installed: pip install onnx onnxruntime openvino
+Example: python -m active6d_tools.studies.compare_runtimes coffee_cup --threads 2
 """
 
-import argparse
 import logging
 import time
 import warnings
@@ -29,17 +28,17 @@ from active6d_perception.estimators.dense.trained_network import load_network
 from active6d_perception.estimators.registry import weights_path
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import load_scene
+from active6d_tools.studies.arguments import study_parser
 
-#: What is timed: no arguments, (channels, h, w) answer.
+#: Runs the network on one input and returns its (channels, h, w) output.
 Answer = Callable[[], np.ndarray]
 _CALIBRATION_VIEWS = (3, 27, 48, 66, 90)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("object")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=15)
+    parser = study_parser(__doc__)
+    parser.add_argument("--threads", type=int, default=1, help="threads of each runtime (default: %(default)s)")
+    parser.add_argument("--repeats", type=int, default=15, help="timed runs (default: %(default)s)")
     arguments = parser.parse_args()
     warnings.filterwarnings("ignore")
     logging.disable(logging.WARNING)
@@ -52,7 +51,7 @@ def main() -> None:
         for view in _CALIBRATION_VIEWS
     ]
     title = f"{model.name}, threads: {arguments.threads}"
-    table = Table("runtime", "clock ms", "CPU ms", "mean error of the axis", title=title)
+    table = Table("runtime", "wall clock ms", "CPU ms", "mean error of the axis", title=title)
     with TemporaryDirectory() as folder, torch.inference_mode():
         reference = network(torch.from_numpy(inputs[0]))[0].numpy()
         for name, answer in runtimes(network, inputs, arguments.threads, Path(folder)):
@@ -62,7 +61,7 @@ def main() -> None:
 
 
 def measure(answer: Answer, repeats: int) -> tuple[float, float]:
-    """Median milliseconds by the clock and of all threads together."""
+    """Median milliseconds of wall clock and of CPU time of all threads."""
     times = []
     for _ in range(repeats + 2):
         clock, processor = time.perf_counter(), time.process_time()
@@ -72,7 +71,7 @@ def measure(answer: Answer, repeats: int) -> tuple[float, float]:
 
 
 def axis_error(answer: np.ndarray, reference: np.ndarray) -> float:
-    """Mean distance between the axes that two answers tell, over the reference's object pixels."""
+    """Mean distance between the axes in two outputs, over the object pixels of the reference."""
     on_object = reference[0] > 0
     axes = [split(each, axis=0)["axis"][:, on_object] for each in (answer, reference)]
     return float(np.linalg.norm(axes[0] - axes[1], axis=0).mean())
@@ -81,7 +80,7 @@ def axis_error(answer: np.ndarray, reference: np.ndarray) -> float:
 def runtimes(
     network: DenseNetwork, inputs: list[np.ndarray], threads: int, folder: Path
 ) -> Iterator[tuple[str, Answer]]:
-    """Name and answer to the first input of every runtime that is installed."""
+    """Name of every installed runtime, and a function that runs it on the first input."""
     yield from torch_runtimes(network, inputs)
     if not find_spec("onnx"):
         return

@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
-"""Expected visibility against the rendered shares stored with the validation scenes: with the true poses given, and of
-the missed objects after a few random views, with nothing given but what the policy knows.
+"""Compare expected visibility with the rendered visible fractions of the validation scenes.
 
-Usage: python -m active6d_tools.studies.compare_visibility OBJECT
+First with the true poses, then for the objects that are missed after a few random views, with what the policy knows.
+
+Example: python -m active6d_tools.studies.compare_visibility mug
 """
-
-import argparse
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.expected_visibility import Tray, expected_visibility
 from active6d_sim.scenes.scene_store import SPLITS, load_scene
+from active6d_tools.studies.arguments import study_parser
 
 VIEWS = (2, 3, 4)
 CHOICES = 15
@@ -30,12 +30,12 @@ def compare_true_poses(model: ObjectModel) -> None:
     scenes = [load_scene(model.name, "val", index) for index in range(SPLITS["val"])]
     rendered = np.concatenate([scene.visible_fraction.T.ravel() for scene in scenes])
     for what, tray in (("with walls", Tray.for_model(model)), ("without walls", None)):
-        told = []
+        expected = []
         for scene in scenes:
             everything = np.concatenate([scene.T_world_object, scene.T_world_hidden])
-            told.append(visibility.shares(everything, eyes, tray)[: len(scene.T_world_object)].ravel())
-        told = np.concatenate(told)
-        off, correlation = np.abs(told - rendered).mean(), np.corrcoef(told, rendered)[0, 1]
+            expected.append(visibility.shares(everything, eyes, tray)[: len(scene.T_world_object)].ravel())
+        expected = np.concatenate(expected)
+        off, correlation = np.abs(expected - rendered).mean(), np.corrcoef(expected, rendered)[0, 1]
         print(f"{model.name} {what:14} mean difference {off:.3f}, correlation {correlation:.3f}")
 
 
@@ -60,8 +60,7 @@ def compare_missed(model: ObjectModel) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
-    parser.add_argument("object")
+    parser = study_parser(__doc__)
     model = load_object(parser.parse_args().object)
     compare_true_poses(model)
     compare_missed(model)

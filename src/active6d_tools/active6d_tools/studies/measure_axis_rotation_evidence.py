@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""Count what depth images show where a handle would be, at right turns and at wrong ones: the ratios of dense/turns.py.
+"""Count pixels of depth images at the place of a handle, for right and for wrong rotations about the axis.
 
-Usage: scripts/measure_axis_rotation_evidence.py OBJECT WEIGHTS SHARD.npz ... [--every N]
+Prints the ratios in dense/axis_rotation.py, and the likelihood of the true rotation for several weights of a pixel. The
+shards are training views that the network was not trained on.
 
-The shards are training views that the weights were not learned from. Also prints the likelihood of the true turns for
-several shares that a pixel may count.
+Example: python -m active6d_tools.studies.measure_axis_rotation_evidence mug
+    src/active6d_perception/active6d_perception/estimators/dense/weights/mug.safetensors
+    ~/.cache/active6d/training/mug/validation/*.npz
 """
 
 import numpy as np
@@ -20,7 +22,7 @@ from active6d_perception.estimators.dense.measured_surface import MeasuredSurfac
 from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera, pool_depth
 from active6d_perception.estimators.refinement import refine
 from active6d_perception.model.model_views import model_views
-from active6d_tools.studies.shard_arguments import read_arguments
+from active6d_tools.studies.arguments import read_arguments
 
 SHAPE = 7, 4
 RIGHT, WRONG, TOLERATED = np.radians([2.6, 30.0, 22.0])
@@ -52,7 +54,7 @@ def count(
 
 
 def main() -> None:
-    model, trained, samples = read_arguments(__doc__.splitlines()[0], every=6)
+    model, trained, samples = read_arguments(__doc__, every=6)
     estimator, search = DenseEstimator(model, trained), AxisRotationSearch(model, trained.canonical_frame)
     tables, turns = zip(
         *(count(sample, estimator, search, trained.canonical_frame) for sample in track(samples)), strict=True
@@ -61,10 +63,11 @@ def main() -> None:
     off = np.abs((AXIS_ANGLES - turns[:, None] + np.pi) % (2 * np.pi) - np.pi)
     right, wrong = (tables[mask].sum(axis=0) for mask in (off < RIGHT, off > WRONG))
     ratio = np.log((right / right.sum() + 3e-4) / (wrong / wrong.sum() + 3e-4))
-    print(f"{len(turns)} instances; rows and columns as in dense/turns.py\n{ratio.reshape(SHAPE).round(1)}")
+    print(f"{len(turns)} instances; rows and columns as in dense/axis_rotation.py\n{ratio.reshape(SHAPE).round(1)}")
     for share in (0.01, 0.02, 0.03, 0.05, 0.1):
         probability = (softmax(share * tables @ ratio, axis=1) * (off < TOLERATED)).sum(axis=1)
-        print(f"a pixel counts {share}: mean log-likelihood of the true turn {np.log(probability + 1e-3).mean():.3f}")
+        likelihood = np.log(probability + 1e-3).mean()
+        print(f"weight of a pixel {share}: mean log-likelihood of the true rotation {likelihood:.3f}")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,8 @@
 #!/usr/bin/env python3
-"""Whether unexplained surface tells of missed objects, on the validation scenes' bank.
+"""Measure how often unexplained surface shows a missed object, on the bank of the validation scenes.
 
-Usage: python -m active6d_tools.studies.measure_unexplained OBJECT [--within FRACTION]
+Example: python -m active6d_tools.studies.measure_unexplained mug --within 0.05
 """
-
-import argparse
 
 import numpy as np
 
@@ -14,24 +12,25 @@ from active6d_core.metrics import DETECTION_FRACTION
 from active6d_perception.scene.fusion import FusionParameters
 from active6d_perception.scene.observed_surface import explainer
 from active6d_sim.scenes.scene_store import find_scene
+from active6d_tools.studies.arguments import study_parser
 
 VIEWS = (2, 3, 4, 6)
 CHOICES = 15
-# A missed object counts as told of with this many cells on it, and as seen from this share of its silhouette on.
+# Unexplained surface shows a missed object with this many cells on it. Objects count from this visible fraction on.
 LEAST_CELLS, LEAST_VISIBLE = 3, 0.1
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("object")
+    parser = study_parser(__doc__)
     within = FusionParameters.explained_within
-    parser.add_argument("--within", type=float, default=within, help="what an object explains, in diameters")
+    text = "an object explains surface within this distance, in diameters (default: %(default)s)"
+    parser.add_argument("--within", type=float, default=within, help=text)
     arguments = parser.parse_args()
     name = arguments.object
     lookup = BatchedFusion(load_bank(find_bank(name, "val")), FusionParameters(explained_within=arguments.within))
     near = explainer(lookup.model, within)
     limit, rng = DETECTION_FRACTION * lookup.model.diameter, np.random.default_rng(0)
-    told, without, cells = [], [], []
+    shown, without, cells = [], [], []
     for index, bank_scene in enumerate(lookup.bank.scenes):
         scene = find_scene(name, bank_scene.name, 0)
         truth = scene.T_world_object
@@ -44,11 +43,11 @@ def main() -> None:
             found = lookup.positions[fused.objects[0]]
             apart = np.linalg.norm(truth[:, None, :3, 3] - found, axis=-1).min(axis=1, initial=np.inf)
             on = near.explains(points, truth)
-            told.extend(on[seen].sum(axis=1) >= LEAST_CELLS)
+            shown.extend(on[seen].sum(axis=1) >= LEAST_CELLS)
             without.extend(on[seen & (apart > 0.3 * lookup.model.diameter)].sum(axis=1) >= LEAST_CELLS)
             rest = ~(on[missed].any(axis=0) | near.explains(points, scene.T_world_hidden).any(axis=0))
             cells.append((len(points), (rest & on.any(axis=0)).sum(), (rest & ~on.any(axis=0)).sum()))
-    print(f"{name}: of {len(told)} missed objects that a view shows {LEAST_VISIBLE:.0%} of, {np.mean(told):.3f} have")
+    print(f"{name}: of {len(shown)} missed objects that a view shows {LEAST_VISIBLE:.0%} of, {np.mean(shown):.3f} have")
     print(f"  {LEAST_CELLS} unexplained cells; of {len(without)} without a hypothesis near them {np.mean(without):.3f}")
     every, of_found, of_nothing = np.mean(cells, axis=0)
     print(f"  {every:.1f} cells on average, {of_found:.2f} of them of found objects and {of_nothing:.3f} of no object")

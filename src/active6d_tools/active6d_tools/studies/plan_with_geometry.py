@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""What somebody could win who knows where every object is, and what each view shows of it, but not what the estimator
-will make of it: how likely a hypothesis is right is learned on the training scenes, from true poses and visibility.
+"""Plan with the true poses and the visible fraction of every object in every view, but without the estimator's results.
 
-Usage: python -m active6d_tools.studies.plan_with_geometry OBJECT [--split SPLIT] [--sample EPISODES]
+The result is an upper bound for planners that know the geometry. The probability that a hypothesis is right is learned
+on the training scenes, from true poses and visible fractions.
+
+Example: python -m active6d_tools.studies.plan_with_geometry mug --sample 200
 """
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from active6d_agent.evaluation.oracle import known
 from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, run_named
 from active6d_core.metrics import DETECTION_FRACTION
 from active6d_sim.scenes.scene_store import SPLITS, load_scene
+from active6d_tools.studies.arguments import study_parser
 
 STEPS = 5
 UPDATES, BATCH = 1500, 1024
@@ -85,10 +87,9 @@ def plan(lookup: BatchedFusion, likely: list[np.ndarray], starts: np.ndarray) ->
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
-    parser.add_argument("object")
-    parser.add_argument("--split", default="test", help="whose scenes to plan in")
-    parser.add_argument("--sample", type=int, default=1000, help="episodes")
+    parser = study_parser(__doc__)
+    parser.add_argument("--split", default="test", help="split of the scenes to plan in (default: %(default)s)")
+    parser.add_argument("--sample", type=int, default=1000, help="number of episodes (default: %(default)s)")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     network = learn(*read_split(arguments.object, "train"))
