@@ -1,8 +1,9 @@
-"""The layers of the design: mathematics without ROS, and packages that import only what they may."""
+"""The layers of the design: mathematics without ROS, a robot without simulator and trainer, packages in order."""
 
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,68 +18,134 @@ MAY_IMPORT = {
     "bringup": {"core", "perception", "agent"},
     "tools": {"core", "sim", "perception", "agent", "bringup"},
 }
+#: What a robot installs.
+ROBOT = ("core", "perception", "agent", "bringup")
+#: Libraries that a robot does not have, and the package that it leaves out.
+NOT_ON_A_ROBOT = {"pybullet", "pybullet_data", "pybullet_utils", "gymnasium", "stable_baselines3", "active6d_sim"}
+#: Modules of the robot's packages that only training uses.
+TRAINING = {
+    "active6d_agent.environment.gym_environment",
+    "active6d_agent.environment.throughput",
+    "active6d_agent.evaluation.ablations",
+    "active6d_agent.policies.attention.ppo",
+    "active6d_agent.policies.sb3",
+}
+#: Registers the environment where Gymnasium is installed, and must import where it is not.
+REGISTRATION = "active6d_agent.environment.registration"
 #: Folders of the conversion and node layers.
 ROS_FOLDERS = {"ros", "nodes"}
-IMPORT_WITHOUT_ROS = """
+#: Modules that need ROS and lie in no such folder.
+ON_ROS = {
+    "active6d_bringup.bags.replay",
+    "active6d_bringup.graph.composition",
+    "active6d_bringup.graph.episode",
+    "active6d_bringup.graph.processes",
+    "active6d_tools.benchmark.graph_overhead",
+    "active6d_tools.benchmark.pipeline",
+    "active6d_tools.describe_nodes",
+    "active6d_tools.graph_doctor",
+}
+IMPORT_BLOCKED = """
 import importlib, sys
 
-class NoRos:
+blocked, modules = sys.argv[1].split(), sys.argv[2:]
+
+class Blocker:
     def find_spec(self, name, path=None, target=None):
         top = name.partition(".")[0]
-        if top in ("rclpy", "rcl_interfaces", "builtin_interfaces") or top.endswith(("_msgs", "_srvs")):
-            raise ModuleNotFoundError(f"no ROS here, and {name} was imported")
+        if top in blocked or "ros" in blocked and top.endswith(("_msgs", "_srvs", "_interfaces")):
+            raise ModuleNotFoundError(f"{name} was imported")
 
-sys.meta_path.insert(0, NoRos())
-failures = 0
-for module in sys.argv[1:]:
+sys.meta_path.insert(0, Blocker())
+failures = []
+for module in modules:
     try:
         importlib.import_module(module)
     except ImportError as error:
-        failures += 1
-        print(f"{module}: {error}")
-sys.exit(failures > 0)
+        failures.append(f"{module}: {error}")
+print("\\n".join(failures))
+sys.exit(len(failures) > 0)
 """
 
 
-def package_folder(package):
-    return SRC / f"active6d_{package}" / f"active6d_{package}"
-
-
-def core_modules(package):
-    root = package_folder(package)
+def modules_of(package: str) -> Iterator[tuple[str, Path]]:
+    """Name and file of each module of a package; what runs when it is imported is left out."""
+    root = SRC / f"active6d_{package}" / f"active6d_{package}"
     for path in sorted(root.rglob("*.py")):
-        parts = path.relative_to(root).with_suffix("").parts
-        if parts[0] not in ROS_FOLDERS:
-            yield ".".join([root.name, *(part for part in parts if part != "__init__")])
+        parts = path.relative_to(root.parent).with_suffix("").parts
+        if parts[-1] != "__main__":
+            yield ".".join(part for part in parts if part != "__init__"), path
 
 
-def imports_of(path):
+def is_core(module: str) -> bool:
+    return not ROS_FOLDERS & set(module.split(".")) and module not in ON_ROS
+
+
+def imports_of(path: Path) -> set[str]:
+    """Top-level names that a file imports, anywhere in it."""
+    names = set()
     for node in ast.walk(ast.parse(path.read_text(), str(path))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            yield node.module
+            names.add(node.module)
+    return {name.partition(".")[0] for name in names}
 
 
-@pytest.mark.parametrize("package", ["core", "sim", "perception", "agent"])
-def test_core_modules_import_without_ros(package):
-    modules = list(core_modules(package))
-    run = subprocess.run(
-        [sys.executable, "-c", IMPORT_WITHOUT_ROS, *modules], capture_output=True, text=True, timeout=100, check=False
-    )
+def import_blocked(blocked: str, modules: list[str]) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-c", IMPORT_BLOCKED, blocked, *modules]
+    return subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+
+
+@pytest.mark.parametrize(
+    ("package", "blocked"),
+    # bags are read and reported on with the message classes, but without a ROS client
+    [
+        *((package, "rclpy ros") for package in ("core", "sim", "perception", "agent")),
+        ("bringup", "rclpy"),
+        ("tools", "rclpy"),
+    ],
+)
+def test_core_modules_import_without_ros(package, blocked):
+    modules = [module for module, _ in modules_of(package) if is_core(module)]
+    assert len(modules) > 1
+    run = import_blocked(blocked, modules)
     assert run.returncode == 0, run.stdout + run.stderr
+
+
+def test_a_robot_imports_without_simulator_and_trainer():
+    """Each module of its packages, the nodes too; what they import in turn counts."""
+    modules = [module for package in ROBOT for module, _ in modules_of(package) if module not in TRAINING]
+    assert REGISTRATION in modules
+    assert {module.rpartition(".")[2] for module in modules} >= {"pose_estimator", "attention_policy", "bag_player"}
+    run = import_blocked(" ".join(NOT_ON_A_ROBOT), modules)
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+@pytest.mark.parametrize("blocked", ["rclpy", "ros", " ".join(NOT_ON_A_ROBOT)])
+def test_blocking_works(blocked):
+    """The two tests above would otherwise pass whatever is imported."""
+    run = import_blocked(blocked, ["active6d_sim.nodes.camera_simulator"])
+    assert run.returncode == 1
+    assert "was imported" in run.stdout
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
 def test_packages_import_only_what_they_may(package):
     allowed = {f"active6d_{name}" for name in MAY_IMPORT[package] | {package}}
-    for path in package_folder(package).rglob("*.py"):
-        tops = {name.partition(".")[0] for name in imports_of(path)}
-        ours = {top for top in tops if top.startswith("active6d_")}
+    for _, path in modules_of(package):
+        ours = {name for name in imports_of(path) if name.startswith("active6d_")}
         assert ours <= allowed, f"{path} imports {sorted(ours - allowed)}"
 
 
-@pytest.mark.parametrize("package", ["core", "perception", "agent", "bringup"])
-def test_a_robot_needs_no_physics(package):
-    for path in package_folder(package).rglob("*.py"):
-        assert not any(name.partition(".")[0] == "pybullet" for name in imports_of(path)), f"{path} imports pybullet"
+@pytest.mark.parametrize("package", ROBOT)
+def test_a_robot_needs_neither_simulator_nor_trainer(package):
+    """Not even inside of a function, but for what only training uses."""
+    for module, path in modules_of(package):
+        needed = imports_of(path) & NOT_ON_A_ROBOT
+        assert not needed or module in TRAINING | {REGISTRATION}, f"{path} imports {sorted(needed)}"
+
+
+def test_lists_of_modules_are_current():
+    modules = {module: path for package in MAY_IMPORT for module, path in modules_of(package)}
+    assert modules.keys() >= TRAINING | ON_ROS
