@@ -25,6 +25,7 @@ from active6d_core.ros.episode_messages import GoalState, GoalStatus
 from active6d_core.se3 import look_at
 from active6d_sim.nodes.camera_simulator import CameraSimulatorNode
 from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.sensor_registry import list_sensors, register_sensor
 from active6d_sim.rendering.simulator import Simulator
 
 SECOND = 1_000_000_000
@@ -307,6 +308,7 @@ def test_before_it_is_active_it_says_so_and_ignores_goals(watched):
         ({"start_view": 100}, "'start_view' is 100, the last is 99"),
         ({"start_view": -2}, "'start_view' is -2, must be >= -1"),
         ({"noise_scale": -1.0}, "'noise_scale'"),
+        ({"sensor": "sonar"}, "'sensor' is 'sonar', must be one of active-stereo"),
         ({"field_of_view": 180.0}, "'field_of_view'"),
         ({"camera_speed": 0.0}, "'camera_speed'"),
         ({"seed": "seven"}, "'seed' must be a int"),
@@ -324,3 +326,24 @@ def test_noise_can_be_off(watched, mugs):
     camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
     clean = Simulator(mugs, camera, SensorNoise.off()).capture(SPHERE.pose(SPHERE.positions[45]), SECOND)
     np.testing.assert_array_equal(image_to_depth(watched.boxes["camera/depth/image_raw"][0]), clean.depth)
+
+
+@register_sensor("constant-depth")
+class ConstantDepth:
+    """Measures the same depth everywhere, and counts its scale into it."""
+
+    def __init__(self, model, scale=1.0):
+        self.model, self.scale = model, scale
+
+    def scaled(self, factor):
+        return ConstantDepth(self.model, factor)
+
+    def measure(self, rendered, camera, rng):
+        return rendered.color, np.full(rendered.depth.shape, 0.5 * self.scale, np.float32)
+
+
+def test_another_sensor_measures(watched):
+    assert list_sensors() == ["active-stereo", "constant-depth"]
+    watched.start(sensor="constant-depth", noise_scale=3.0)
+    depth = image_to_depth(watched.boxes["camera/depth/image_raw"][0])
+    np.testing.assert_array_equal(depth, np.full((48, 64), 1.5, np.float32))

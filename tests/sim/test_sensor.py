@@ -6,8 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from active6d_core.camera import PinholeCamera, pixel_rays
+from active6d_core.object_model import load_object
 from active6d_sim.rendering.renderer import RenderedView
-from active6d_sim.rendering.sensor import SensorNoise, apply
+from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.sensor_registry import create_sensor, sensor_origins
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240, 60.0)
 NOTHING = SensorNoise.off()
@@ -30,7 +32,7 @@ def wall(depth=0.8, degrees=0.0) -> RenderedView:
 
 
 def measure(view, noise, seed=0):
-    return apply(view, CAMERA, noise, np.random.default_rng(seed))
+    return noise.measure(view, CAMERA, np.random.default_rng(seed))
 
 
 def missing_share(view, noise) -> float:
@@ -149,3 +151,10 @@ def test_scaled(factor):
 def test_bad_parameters_are_named(name, value):
     with pytest.raises(ValueError, match=name):
         SensorNoise(**{name: value})
+
+
+def test_the_default_sensor_is_active_stereo():
+    assert create_sensor("active-stereo", load_object("mug")) == SensorNoise()
+    assert sensor_origins()["active-stereo"] == "built in"
+    with pytest.raises(ValueError, match="unknown sensor 'sonar'; known: auto, active-stereo"):
+        create_sensor("sonar", load_object("mug"))

@@ -1,9 +1,9 @@
 """Parts that are chosen by name, such as estimators and policies: built in, or added by other packages and modules.
 
-A package adds parts by entry points of the group ``active6d.estimators`` or ``active6d.policies``: the entry point's
-name is the part's name, its value a factory ``module:attribute``. A module adds parts by registering them when it is
-imported; the environment variable ``ACTIVE6D_IMPORT`` names such modules, separated by commas. Child processes and
-ROS nodes inherit it. Nothing else is imported, and a part's module only when parts are asked for.
+A package adds parts by entry points of the groups ``active6d.estimators``, ``active6d.policies`` and
+``active6d.sensors``: the entry point's name is the part's name, its value a factory ``module:attribute``. A module adds
+parts by registering them when it is imported. The environment variable ``ACTIVE6D_IMPORT`` names such modules,
+separated by commas. Child processes and ROS nodes inherit it. A part's module is imported when a part is asked for.
 """
 
 import inspect

@@ -17,7 +17,7 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_sim.physics.heap import drop_heap
 from active6d_sim.rendering.appearance import Appearance
 from active6d_sim.rendering.renderer import SceneRenderer
-from active6d_sim.rendering.sensor import SensorNoise, apply
+from active6d_sim.rendering.sensor import SensorNoise
 from active6d_sim.scenes.scene import Bin, Scene
 from active6d_sim.scenes.scene_store import load_scene
 
@@ -103,7 +103,7 @@ def _capture(
     truth_scale: float,
 ) -> TrainingView:
     rendered = renderer.render(T_world_camera, camera)
-    color, depth = apply(rendered, camera, noise, rng)
+    color, depth = noise.measure(rendered, camera, rng)
     coarse = camera.scaled(truth_scale)
     truth = renderer.render(T_world_camera, coarse, shaded=False)
     visible, whole = renderer.instance_layers(T_world_camera, coarse)

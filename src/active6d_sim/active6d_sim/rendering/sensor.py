@@ -7,7 +7,9 @@ from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 from scipy.special import expit
 
 from active6d_core.camera import PinholeCamera, pixel_rays
+from active6d_core.object_model import ObjectModel
 from active6d_sim.rendering.renderer import RenderedView
+from active6d_sim.rendering.sensor_registry import DEFAULT_SENSOR, register_sensor
 
 
 @dataclass(frozen=True)
@@ -81,25 +83,30 @@ class SensorNoise:
         """Standard deviation in metres of a depth (...,) in metres."""
         return depth**2 * (self.disparity / (camera.fx * self.baseline))
 
+    def measure(
+        self, rendered: RenderedView, camera: PinholeCamera, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Measure a perfect view.
 
-def apply(
-    rendered: RenderedView, camera: PinholeCamera, noise: SensorNoise, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Measure a perfect view.
+        Returns:
+            (H, W, 3) uint8 colour, and (H, W) float32 depth in metres with NaN for missing returns.
+        """
+        if rendered.color is None:
+            raise ValueError("the view was rendered without colour")
+        missing = rng.random(rendered.depth.shape, np.float32) < _loss(rendered, camera, self)
+        depth = _jittered(rendered.depth, self.jitter, rng)
+        if self.disparity > 0:
+            depth = depth + self.depth_sigma(depth, camera) * _correlated(depth.shape, self.patch, rng)
+        if self.quantum > 0:
+            depth = np.round(depth / self.quantum) * self.quantum
+        depth = np.where(missing, np.nan, depth).astype(np.float32)
+        return _noisy_color(rendered.color, self.color, rng), depth
 
-    Returns:
-        (H, W, 3) uint8 colour, and (H, W) float32 depth in metres with NaN for missing returns.
-    """
-    if rendered.color is None:
-        raise ValueError("the view was rendered without colour")
-    missing = rng.random(rendered.depth.shape, np.float32) < _loss(rendered, camera, noise)
-    depth = _jittered(rendered.depth, noise.jitter, rng)
-    if noise.disparity > 0:
-        depth = depth + noise.depth_sigma(depth, camera) * _correlated(depth.shape, noise.patch, rng)
-    if noise.quantum > 0:
-        depth = np.round(depth / noise.quantum) * noise.quantum
-    depth = np.where(missing, np.nan, depth).astype(np.float32)
-    return _noisy_color(rendered.color, noise.color, rng), depth
+
+@register_sensor(DEFAULT_SENSOR)
+def active_stereo(model: ObjectModel) -> SensorNoise:
+    """The short-range active stereo camera; ``model`` makes no difference."""
+    return SensorNoise()
 
 
 def _loss(rendered: RenderedView, camera: PinholeCamera, noise: SensorNoise) -> np.ndarray:

@@ -6,7 +6,8 @@ from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View
 from active6d_core.se3 import is_rigid
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.rendering.renderer import RenderedView, SceneRenderer
-from active6d_sim.rendering.sensor import SensorNoise, apply
+from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.sensor_registry import Sensor
 from active6d_sim.scenes.scene import Scene
 
 NANOSECONDS = 1_000_000_000
@@ -20,7 +21,7 @@ class Simulator:
     """An RGB-D camera that can be put anywhere in a scene."""
 
     def __init__(
-        self, scene: Scene, camera: PinholeCamera = DEFAULT_CAMERA, noise: SensorNoise = SensorNoise(), seed: int = 0
+        self, scene: Scene, camera: PinholeCamera = DEFAULT_CAMERA, noise: Sensor = SensorNoise(), seed: int = 0
     ) -> None:
         """
         Args:
@@ -36,10 +37,10 @@ class Simulator:
         """The view from (4, 4) ``T_world_camera``; its noise depends on the seed and ``stamp`` (nanoseconds) alone."""
         return self.sense(self.renderer.render(T_world_camera, self.camera), T_world_camera, stamp, self.noise)
 
-    def sense(self, rendered: RenderedView, T_world_camera: np.ndarray, stamp: int, noise: SensorNoise) -> View:
+    def sense(self, rendered: RenderedView, T_world_camera: np.ndarray, stamp: int, noise: Sensor) -> View:
         """What the sensor makes of a view rendered from (4, 4) ``T_world_camera``, with other noise than its own."""
         rng = np.random.default_rng([self.seed, stamp])
-        color, depth = apply(rendered, self.camera, noise, rng)
+        color, depth = noise.measure(rendered, self.camera, rng)
         return View(stamp, color, depth, self.camera, np.array(T_world_camera, float))
 
 

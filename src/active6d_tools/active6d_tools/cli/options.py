@@ -50,7 +50,7 @@ Imports = Annotated[
         "--import",
         metavar="MODULE",
         callback=_import_modules,
-        help="Import a Python module that registers estimators or policies; repeatable.",
+        help="Import a Python module that registers estimators, policies or sensors; repeatable.",
     ),
 ]
 
