@@ -1,0 +1,69 @@
+"""Training views are rendered once, one file for each pile."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from active6d_tools import training_data
+from active6d_tools.threads import single_threaded
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """Arguments of every rendering, in threads and without the physics."""
+    calls = []
+
+    def render(*arguments):
+        path = arguments[-1]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        calls.append(arguments)
+
+    monkeypatch.setattr(training_data, "render_training", render)
+    monkeypatch.setattr(training_data, "render_validation", render)
+    monkeypatch.setattr(training_data, "ProcessPoolExecutor", lambda workers, mp_context: ThreadPoolExecutor(workers))
+    return calls
+
+
+def test_only_missing_files_are_rendered(rendered, tmp_path):
+    progress = []
+    first = training_data.FIRST_SEED
+    shards = training_data.render_missing("mug", tmp_path, 2, 5, 1, lambda *done: progress.append(done))
+    assert [path.relative_to(tmp_path).as_posix() for path in shards["training"]] == [
+        f"training-5/{first}.npz",
+        f"training-5/{first + 1}.npz",
+    ]
+    assert [path.relative_to(tmp_path).as_posix() for path in shards["validation"]] == [
+        f"validation/{index}.npz" for index in range(training_data.SPLITS["val"])
+    ]
+    total = 2 + training_data.SPLITS["val"]
+    assert progress == [(done, total) for done in range(total + 1)]
+    assert ("mug", first, 5, shards["training"][0]) in rendered
+    assert ("mug", 0, shards["validation"][0]) in rendered
+    shards["training"][1].unlink()
+    rendered.clear()
+    assert training_data.render_missing("mug", tmp_path, 2, 5, 1) == shards
+    assert rendered == [("mug", first + 1, 5, shards["training"][1])]
+
+
+def test_a_rendered_pile_is_read_as_training_views(tmp_path):
+    from active6d_perception.estimators.dense.training.samples import read_shard
+
+    path = tmp_path / "deep" / "1.npz"
+    training_data.render_training("bunny", training_data.FIRST_SEED, 1, path)
+    (view,) = read_shard(path)
+    assert len(view.T_camera_object) == len(view.visible_fraction) > 0
+    assert view.visible_fraction.max() > 0.5
+    assert set(view.instance[view.instance >= 0].tolist()) <= set(range(len(view.T_camera_object)))
+
+
+@pytest.mark.parametrize("before", [None, "4"])
+def test_the_number_of_threads_is_restored(monkeypatch, before):
+    import os
+
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if before is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", before)
+    with single_threaded():
+        assert os.environ["OMP_NUM_THREADS"] == "1"
+    assert os.environ.get("OMP_NUM_THREADS") == before
