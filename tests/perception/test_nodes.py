@@ -5,6 +5,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray
 from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -213,6 +215,21 @@ FUSION_INPUTS = (
 def fusion(graph, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return graph.add(HypothesisFusionNode(context=graph.context))
+
+
+def test_an_object_set_on_an_unconfigured_node_is_the_one_that_is_loaded(graph):
+    node = graph.add(PoseEstimatorNode(context=graph.context, overrides={"estimator": "geometric"}), start=False)
+    for name, loaded in (("coffee_cup", None), ("teapot", "unknown object 'teapot'")):
+        request = SetParameters.Request(parameters=[Parameter("object", value=name).to_parameter_msg()])
+        (result,) = graph.call(SetParameters, "pose_estimator/set_parameters", request).results
+        assert result.successful, result.reason
+        if loaded is None:
+            node.trigger_configure()
+            assert node._estimator.model.name == name
+            node.trigger_cleanup()
+        else:
+            with pytest.raises(ValueError, match=loaded):
+                node.start()
 
 
 def test_fusion_publishes_verified_objects(graph, fusion, seen, tmp_path):

@@ -27,7 +27,7 @@ class Check:
         ok: whether it is there and works.
         needed: whether the core path (simulate, estimate, fuse, move, record, report) needs it.
         detail: version or finding, one line.
-        fix: how to get it, empty when ``ok``.
+        fix: how to install or repair it, empty when ``ok``.
     """
 
     group: str
@@ -87,7 +87,7 @@ def _libraries() -> Iterator[Check]:
         yield _import_check("Python libraries", module, distribution, needed=True, fix=PIP)
     optional = {
         # The wrapper, since pybullet itself prints a banner.
-        "active6d_sim.physics.bullet": ("pybullet", "new heaps in the simulator; a robot needs none"),
+        "active6d_sim.physics.bullet": ("pybullet", "simulating new piles; a robot does not need it"),
         "torch": ("torch", "learned estimator, policies and training"),
         "safetensors": ("safetensors", "weights"),
         "gymnasium": ("gymnasium", "training policies"),

@@ -44,7 +44,7 @@ _QUATERNION_TOLERANCE = 1e-2
 
 #: What marks a diagnostic status as one of this project's nodes.
 HARDWARE_ID = "active6d"
-#: More rows than any heap needs; fusion's memory grows with their square.
+#: More rows than any pile needs; fusion's memory grows with their square.
 _MAX_ROWS = 2000
 #: More points than the surface of any workspace has cells.
 _MAX_POINTS = 100_000
@@ -449,7 +449,7 @@ def objects_to_markers(objects: SceneObjects, mesh_uri: str, stamp: int, frame: 
     """One mesh per object, from red (verification score 0) to green (1), after one marker that clears the last ones."""
     header = make_header(stamp, frame)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
-    # Copies share all that is alike: making a Marker anew costs ten times as much.
+    # Copies share all that is alike: making a new Marker costs ten times as much.
     alike = Marker(header=header, ns="objects", type=Marker.MESH_RESOURCE, mesh_resource=mesh_uri)
     alike.scale = Vector3(x=1.0, y=1.0, z=1.0)
     poses = _transforms_to_poses(objects.T_world_object)

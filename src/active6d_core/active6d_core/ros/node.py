@@ -295,7 +295,7 @@ class GraphNode(ParameterNode):
         # Any failure must become a refused transition: rclpy would swallow the exception and lose its text.
         except Exception as error:
             self._failure = error
-            if not self._starting:  # who calls start() is told by the exception
+            if not self._starting:  # the exception reaches the caller of start()
                 self.get_logger().error(f"{step.__name__} failed: {error}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
