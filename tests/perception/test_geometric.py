@@ -22,7 +22,7 @@ from active6d_perception.estimators.registry import (
 )
 from active6d_perception.estimators.single_view_evaluation import LabelledView, detection_over_views, evaluate_estimator
 from active6d_perception.suppression import suppress
-from active6d_sim.physics.heap import drop_heap
+from active6d_sim.physics.heap import simulate_heap
 from active6d_sim.rendering.simulator import Simulator
 
 SPHERE = ViewSphere()
@@ -31,7 +31,7 @@ NAMES = ("coffee_cup", "bunny", "mug")
 
 @lru_cache
 def dropped(model, seed, count):
-    return drop_heap(model, seed, count=count)
+    return simulate_heap(model, seed, count=count)
 
 
 def captures(model, views, seed, count=None):

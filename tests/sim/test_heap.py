@@ -77,7 +77,7 @@ def test_objects_rest(scene):
 
 def test_same_seed_same_heap_other_seed_other_heap():
     model = load_object("coffee_cup")
-    first, again, other = (heap.drop_heap(model, seed, count=2) for seed in (3, 3, 4))
+    first, again, other = (heap.simulate_heap(model, seed, count=2) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.T_world_object, again.T_world_object)
     np.testing.assert_array_equal(first.visible_fraction, again.visible_fraction)
     assert not np.allclose(first.T_world_object, other.T_world_object)
@@ -94,13 +94,13 @@ def test_scene_says_where_it_comes_from(bunny_heap):
 def test_fallen_objects_leave():
     """On a plate too small for them, objects fall to the table: they are in no scene."""
     model = load_object("coffee_cup")
-    scene = heap.drop_heap(model, 1, count=3, bin=Bin(0.08, 0.08, 0.0))
+    scene = heap.simulate_heap(model, 1, count=3, bin=Bin(0.08, 0.08, 0.0))
     assert len(scene.T_world_all) < 3
 
 
 def test_count_below_one_is_refused():
     with pytest.raises(ValueError, match="count=0"):
-        heap.drop_heap(load_object("mug"), 0, count=0)
+        heap.simulate_heap(load_object("mug"), 0, count=0)
 
 
 @pytest.mark.parametrize("name", ["mug", "bunny", "coffee_cup"])

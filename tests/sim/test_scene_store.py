@@ -98,7 +98,7 @@ def test_generate_makes_what_is_missing(tmp_path, monkeypatch):
             future.set_result(function(*arguments))
             return future
 
-    monkeypatch.setattr(scene_store, "drop_heap", drop)
+    monkeypatch.setattr(scene_store, "simulate_heap", drop)
     monkeypatch.setattr(scene_store, "ProcessPoolExecutor", SameProcess)
     made = list(generate("mug", tmp_path, splits=("val",), workers=2))
     assert sorted(path.name for path in made) == [f"val_{index:02d}.npz" for index in range(6)]

@@ -1,1 +1,1 @@
-"""Recorded scenes in BOP format, and rendered training views."""
+"""Recorded scenes in BOP format, and simulated training views."""

@@ -1,8 +1,10 @@
-"""Scenes recorded in the folder format of BOP (``docs/bop_datasets_format.md`` of https://github.com/thodan/bop_toolkit).
+"""Reading and writing of recorded scenes in BOP's folder format.
+
+The format is described in ``docs/bop_datasets_format.md`` of https://github.com/thodan/bop_toolkit.
 
 A folder holds ``scene_camera.json`` (intrinsics and the camera's pose in the world), ``rgb/NNNNNN.png``,
 ``depth/NNNNNN.png`` (16 bit, 0 without a return) and, optionally, ``scene_gt.json`` (object poses in the camera) and
-``scene_gt_info.json`` (visible fractions). On disk lengths are millimetres; here they are metres.
+``scene_gt_info.json`` (visible fractions). Lengths are millimetres on disk and metres here.
 """
 
 import json
@@ -18,19 +20,19 @@ from active6d_core.camera import PinholeCamera, View
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform, transform_from_quaternion
 
 CAMERA_FILE, TRUTH_FILE, VISIBILITY_FILE = "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
-#: Published datasets round rotations to about six digits; what is further from orthonormal was not meant as one.
+#: Published datasets round rotations to about six digits; matrices farther from orthonormal are refused.
 _ROTATION_TOLERANCE = 1e-3
 _DEEPEST = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True, eq=False)
 class ImageTruth:
-    """What is known of the n objects of one image.
+    """Ground truth of the n objects in one image.
 
     Attributes:
-        object_id: (n,) int, BOP's number of the object's model.
+        object_id: (n,) int, BOP's number of each object's model.
         T_camera_object: (n, 4, 4) poses in the optical frame, metres.
-        visible_fraction: (n,) share of the silhouette that is visible, NaN where the recording does not say.
+        visible_fraction: (n,) share in [0, 1] of each silhouette that is visible, NaN if not recorded.
     """
 
     object_id: np.ndarray
@@ -40,10 +42,10 @@ class ImageTruth:
 
 @dataclass(frozen=True, eq=False)
 class BopScene:
-    """m recorded views of one scene; images are read when they are asked for.
+    """m recorded views of one scene; images are read on demand.
 
     Attributes:
-        folder: where it lies.
+        folder: folder of the scene.
         image_ids: (m) BOP's image numbers, ascending.
         cameras: (m) intrinsics.
         T_world_camera: (m, 4, 4) poses of the optical frame in the recording's world, metres; the identity where the
@@ -61,14 +63,14 @@ class BopScene:
 
     @classmethod
     def load(cls, folder: str | Path, needs_poses: bool = True) -> "BopScene":
-        """Read and check everything but the pixels.
+        """Read and check everything except the pixels.
 
         Args:
             folder: of the scene.
             needs_poses: refuse a recording without camera poses.
 
         Raises:
-            ValueError: a file is missing or broken, or a key is missing or has a wrong value; the message names both.
+            ValueError: a file is missing or damaged, or a key is missing or has a wrong value; the message names both.
         """
         folder = Path(folder)
         path = folder / CAMERA_FILE
@@ -98,10 +100,10 @@ class BopScene:
         return len(self.image_ids)
 
     def view(self, index: int, stamp: int) -> View:
-        """The ``index``-th view, stamped with ``stamp`` nanoseconds.
+        """Read the ``index``-th view and give it the stamp ``stamp`` (nanoseconds).
 
         Raises:
-            ValueError: an image is damaged or of another kind; the message names the file.
+            ValueError: an image is damaged or has another kind of pixels; the message names the file.
         """
         camera, image = self.cameras[index], self.image_ids[index]
         color = _read_pixels(_image_path(self.folder, "rgb", image), camera)
@@ -115,12 +117,12 @@ class BopScene:
         return View(stamp, np.ascontiguousarray(color[..., :3], np.uint8), depth, camera, self.T_world_camera[index])
 
     def nearest(self, position: np.ndarray) -> int:
-        """Index of the view whose direction from the world's origin is nearest to that of (3,) ``position``."""
+        """Index of the view whose direction from the world's origin is nearest to that of (3,) ``position``, metres."""
         positions = self.T_world_camera[:, :3, 3]
         return int(np.argmax(positions @ position / np.linalg.norm(positions, axis=1)))
 
     def T_world_object(self, index: int, object_id: int | None = None) -> np.ndarray:
-        """(n, 4, 4) ground truth of the ``index``-th view in the world, of one kind of object or of all.
+        """(n, 4, 4) true poses in the world, metres, from the ``index``-th view, of one object model or of all.
 
         Raises:
             ValueError: the recording has no ground truth.
@@ -141,18 +143,18 @@ def write_bop_scene(
     visible_fraction: np.ndarray | None = None,
     depth_scale: float = 0.1,
 ) -> None:
-    """Record views of (n, 4, 4) ``T_world_object`` as a scene folder, images numbered in order from 0.
+    """Write views of a scene as a BOP folder; images are numbered from 0.
 
     Args:
-        folder: made if need be.
-        views: what the camera saw.
-        T_world_object: ground truth, the same in all views.
+        folder: folder to write, created if it does not exist.
+        views: m views of the camera.
+        T_world_object: (n, 4, 4) true poses in the world, metres, the same in all views.
         object_id: BOP's number of the objects' model, from 1.
-        visible_fraction: (m, n) for ``scene_gt_info.json``, which is left out when None.
-        depth_scale: millimetres per step; depth is rounded to it, and beyond 65535 steps there is no return.
+        visible_fraction: (m, n) for ``scene_gt_info.json``; without it the file is not written.
+        depth_scale: millimetres per step of the depth image; depth beyond 65535 steps is written as missing.
 
     Raises:
-        ValueError: ``folder`` holds a scene already, or an argument is out of range.
+        ValueError: ``folder`` already holds a scene, or an argument is out of range.
     """
     folder = Path(folder)
     if (folder / CAMERA_FILE).exists():
@@ -190,7 +192,7 @@ def _pose_entry(T: np.ndarray, rotation: str, translation: str) -> dict[str, lis
 
 
 def _write_by_image(path: Path, entries: dict[int, Any]) -> None:
-    """One image a line, as BOP's own tools write it."""
+    """Write one line per image, as BOP's tools do."""
     lines = ",\n".join(f'  "{image}": {json.dumps(entry)}' for image, entry in entries.items())
     path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
 
@@ -269,13 +271,13 @@ def _read_camera_pose(entry: Any, path: Path, image: int, needed: bool) -> np.nd
 
 
 def _image_path(folder: Path, kind: str, image: int) -> Path:
-    """The image's file; published datasets have colour as JPEG, too."""
+    """Path of an image; published datasets have colour as PNG or JPEG."""
     png, jpg = (folder / kind / f"{image:06d}.{ending}" for ending in ("png", "jpg"))
     return png if png.is_file() or not jpg.is_file() else jpg
 
 
 def _size(path: Path) -> tuple[int, int]:
-    """Width and height, from the file's header alone."""
+    """Width and height in pixels, from the file's header."""
     try:
         with Image.open(path) as picture:
             return picture.size
@@ -290,7 +292,7 @@ def _read_pixels(path: Path, camera: PinholeCamera) -> np.ndarray:
     try:
         with Image.open(path) as picture:
             pixels = np.array(picture)
-    # Pillow's decoders raise many kinds on damaged files, SyntaxError among them.
+    # Pillow's decoders raise many kinds of errors on damaged files, including SyntaxError.
     except Exception as error:
         raise ValueError(f"{path}: not a readable image ({error})") from error
     if pixels.shape[:2] != (camera.height, camera.width):

@@ -1,7 +1,7 @@
-"""Views with ground truth to learn a pose estimator from: random heaps, bins, looks, cameras and sensor noise.
+"""Simulated training views for pose estimators: random heaps, bins, appearances, cameras and sensor noise.
 
-Test scenes are never learned from: heaps to learn from are dropped from their own range of seeds, which
-:func:`training_heap` insists on.
+Heaps for training have their own range of seeds, which :func:`training_heap` enforces, so that none of them is a test
+scene.
 """
 
 from collections.abc import Iterator
@@ -14,40 +14,45 @@ from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import invert, look_at, make_transform
 from active6d_core.training_view import TrainingView
 from active6d_core.view_sphere import ViewSphere
-from active6d_sim.physics.heap import drop_heap
+from active6d_sim.physics.heap import simulate_heap
 from active6d_sim.rendering.appearance import Appearance
 from active6d_sim.rendering.renderer import SceneRenderer
 from active6d_sim.rendering.sensor import SensorNoise
 from active6d_sim.scenes.scene import Bin, Scene
 from active6d_sim.scenes.scene_store import load_scene
 
-#: Heaps to learn from are dropped from seeds from here on; those of stored scenes and of episodes are smaller.
+#: Smallest seed of heaps for training; the seeds of stored scenes and of episodes are smaller.
 FIRST_SEED = 1_000_000
 
-_VIEWS_PER_LOOK = 8  # a look costs as much as four views
+_VIEWS_PER_APPEARANCE = 8  # a new appearance takes as long as four views
 
 
 def training_heap(model: ObjectModel, seed: int) -> Scene:
-    """Drop a random heap: a single object up to a few more than usual, in a bin with or without walls.
+    """Simulate a random heap: from one object to a few more than usual, in a bin with or without walls.
 
     Raises:
         ValueError: ``seed`` is below :data:`FIRST_SEED`.
     """
     if seed < FIRST_SEED:
-        raise ValueError(f"heaps to learn from need seeds from {FIRST_SEED} on, got {seed}: others are for evaluation")
+        raise ValueError(f"heaps for training need seeds from {FIRST_SEED} on, got {seed}: others are for evaluation")
     rng = np.random.default_rng([seed, 1])
     most = model.instances[1]
     count = int(rng.integers(model.instances[0], most + 3) if rng.random() < 0.7 else rng.integers(1, most))
     usual = Bin.for_model(model)
     width, depth = usual.inner_width * rng.uniform(0.85, 1.25, 2)
     height = 0.0 if rng.random() < 0.25 else usual.wall_height * rng.uniform(0.3, 1.5)
-    return drop_heap(model, seed, count=count, bin=Bin(width, depth, height), name=f"{model.name}/training/{seed}")
+    return simulate_heap(model, seed, count=count, bin=Bin(width, depth, height), name=f"{model.name}/training/{seed}")
 
 
 def random_camera(rng: np.random.Generator, width: int = 640, height: int = 480) -> tuple[PinholeCamera, np.ndarray]:
-    """Intrinsics, and a (4, 4) ``T_world_camera`` that looks about at the bin from anywhere above the table.
+    """Random intrinsics, and a (4, 4) ``T_world_camera`` that looks approximately at the bin from above the table.
 
-    Most cameras stand upright, as on the view hemisphere; a fifth are turned about their axis at will.
+    Most cameras are nearly upright, as on the view hemisphere; a fifth have a random roll angle.
+
+    Args:
+        rng: random generator.
+        width: image width in pixels.
+        height: image height in pixels.
     """
     camera = PinholeCamera.from_field_of_view(width, height, rng.uniform(56.0, 64.0))
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.arcsin(rng.uniform(np.sin(np.radians(12)), 1.0))
@@ -66,18 +71,20 @@ def training_views(
     truth_scale: float = 0.25,
     threads: int = 0,
 ) -> Iterator[TrainingView]:
-    """``count`` views of a heap: random cameras, noise up to doubled, and another look every few views.
+    """Simulate views of a heap from random cameras.
+
+    The sensor noise is up to twice the default, and the appearance changes every few views.
 
     Args:
         scene: from :func:`training_heap`.
         model: its object.
-        count: of views.
-        rng: source of randomness.
-        truth_scale: resolution of the truth, relative to the view's.
-        threads: for ray casting, 0 for all cores.
+        count: number of views.
+        rng: random generator.
+        truth_scale: resolution of the truth relative to the view.
+        threads: number of threads for ray casting, 0 for one per core.
     """
     for index in range(count):
-        if index % _VIEWS_PER_LOOK == 0:
+        if index % _VIEWS_PER_APPEARANCE == 0:
             renderer = SceneRenderer(scene, model=model, appearance=Appearance.random(rng), threads=threads)
         camera, T_world_camera = random_camera(rng)
         yield _capture(renderer, camera, T_world_camera, SensorNoise().scaled(rng.uniform(0, 2)), rng, truth_scale)
@@ -86,7 +93,15 @@ def training_views(
 def validation_views(
     object_name: str, index: int, *, count: int = 12, truth_scale: float = 0.25, threads: int = 0
 ) -> Iterator[TrainingView]:
-    """``count`` views of the grid of one stored scene of the validation split, as the simulator shows them."""
+    """Simulate views of one stored scene of the validation split with the simulator's default camera and noise.
+
+    Args:
+        object_name: name of the object.
+        index: of the scene in the split.
+        count: number of views, drawn from the grid of the view hemisphere.
+        truth_scale: resolution of the truth relative to the view.
+        threads: number of threads for ray casting, 0 for one per core.
+    """
     scene = load_scene(object_name, "val", index)
     renderer = SceneRenderer(scene, model=load_object(object_name), appearance_seed=scene.seed, threads=threads)
     rng, sphere = np.random.default_rng(scene.seed), ViewSphere()

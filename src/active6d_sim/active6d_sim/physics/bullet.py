@@ -1,4 +1,4 @@
-"""pybullet without what its C code prints: an import banner, a line per connection, and every step of V-HACD."""
+"""pybullet with the output of its C code silenced: an import banner, a line per connection, and the log of V-HACD."""
 
 import ctypes
 import os
@@ -11,7 +11,7 @@ _LIBC = ctypes.CDLL(None)
 
 @contextmanager
 def silence(*streams: int) -> Iterator[None]:
-    """Discard what C code writes to file descriptors (1 is standard output, 2 standard error) meanwhile."""
+    """Discard the output of C code to file descriptors: 1 is standard output, 2 is standard error."""
     _LIBC.fflush(None)
     saved = [os.dup(stream) for stream in streams]
     with open(os.devnull, "w") as null:
@@ -32,12 +32,12 @@ with silence(1, 2):
 
 
 def connect() -> BulletClient:
-    """A physics server of one's own, in this process and without a window."""
+    """Start a separate physics server in this process, without a window."""
     with silence(1):
         return BulletClient(connection_mode=pybullet.DIRECT)
 
 
 def decompose(source: str, parts: str, log: str) -> None:
-    """Write the convex parts (V-HACD) of the ``.obj`` file ``source`` to ``parts``, one group each."""
+    """Write the convex parts (V-HACD) of the ``.obj`` file ``source`` to the file ``parts``, one group per part."""
     with silence(1):
         pybullet.vhacd(source, parts, log, resolution=400_000, concavity=0.001, maxNumVerticesPerCH=48)

@@ -1,4 +1,4 @@
-"""Heaps of identical objects, dropped by rigid-body physics into a bin until they rest."""
+"""Simulation of heaps: identical objects fall into a bin by rigid-body physics until they are at rest."""
 
 import hashlib
 from pathlib import Path
@@ -13,31 +13,31 @@ from active6d_sim.physics.bullet import BulletClient, connect, decompose, pybull
 from active6d_sim.rendering.renderer import visible_fractions
 from active6d_sim.scenes.scene import Bin, Scene
 
-#: An object of which no view of the grid shows this share of its silhouette belongs to no ground truth.
+#: An object belongs to the ground truth if some view of the grid shows at least this share of its silhouette.
 VISIBILITY_THRESHOLD = 0.1
 
 _STEPS_PER_SECOND = 240
 _SECONDS_BETWEEN_DROPS = 0.25
 _MASS = 0.2
 _CONTACT = {"lateralFriction": 0.5, "rollingFriction": 2e-4, "restitution": 0.05}
-#: What has fallen out of the bin after the first round is dropped once more.
+#: Objects that fall out of the bin in the first round are released once more in a second one.
 _ROUNDS = 2
 
 
-def drop_heap(
+def simulate_heap(
     model: ObjectModel, seed: int, *, count: int | None = None, bin: Bin | None = None, name: str | None = None
 ) -> Scene:
-    """Drop ``count`` instances in random poses into ``bin`` and let them come to rest.
+    """Simulate a heap: ``count`` instances fall from random poses into ``bin`` and come to rest.
 
-    While they fall, guides above the bin's walls keep them in; then the guides go, and what falls out of the bin is
-    removed and dropped once more. The same seed gives the same scene.
+    Guides above the bin's walls keep the falling objects inside and are removed afterwards. Objects that then fall out
+    of the bin are released once more. The same seed gives the same scene.
 
     Args:
-        model: the object; its mesh's origin is its centre of mass.
-        seed: of the number of instances and their start poses.
-        count: instances to drop; drawn from ``model.instances`` when None.
-        bin: default :meth:`Bin.for_model`.
-        name: of the scene; ``<object>/seed/<seed>`` when None.
+        model: the object; the origin of its mesh is its centre of mass.
+        seed: seed of the number of instances and of their initial poses.
+        count: number of instances; drawn from ``model.instances`` when None.
+        bin: the bin; :meth:`Bin.for_model` when None.
+        name: name of the scene; ``<object>/seed/<seed>`` when None.
 
     Raises:
         ValueError: ``count`` is below 1.
@@ -57,7 +57,7 @@ def drop_heap(
 
 
 def _simulate(model: ObjectModel, bin: Bin, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(k, 4, 4) poses of the objects that rest in the bin; k is ``count`` unless some fall out twice."""
+    """(k, 4, 4) ``T_world_object`` of the objects at rest in the bin; k is ``count`` unless some fall out twice."""
     client = connect()
     try:
         client.setGravity(0, 0, -9.81)
@@ -92,7 +92,7 @@ def _simulate(model: ObjectModel, bin: Bin, count: int, rng: np.random.Generator
 def _drop(
     client: BulletClient, model: ObjectModel, bin: Bin, count: int, present: list[int], rng: np.random.Generator
 ) -> list[int]:
-    """Release ``count`` instances one after another just above those ``present``, so that none arrives fast."""
+    """Release ``count`` instances one after another just above those ``present``, so that all arrive slowly."""
     shape = client.createCollisionShape(pybullet.GEOM_MESH, fileName=str(collision_file(model)))
     reach = np.maximum(np.array([bin.inner_width, bin.inner_depth]) / 2 - model.diameter / 2, 0.0)
     bodies: list[int] = []
@@ -109,7 +109,7 @@ def _drop(
 
 
 def _settle(client: BulletClient, bodies: list[int], seconds: float = 4.0) -> None:
-    """Step until nothing has moved for a quarter of a second; damping grows, so that rolling objects stop as well."""
+    """Step until nothing has moved for a quarter of a second; damping grows, so that rolling objects stop too."""
     block = _STEPS_PER_SECOND // 8
     still = 0
     for damping in np.linspace(0.5, 0.99, round(seconds * 8)):
@@ -125,7 +125,7 @@ def _settle(client: BulletClient, bodies: list[int], seconds: float = 4.0) -> No
 
 
 def _remove_fallen(client: BulletClient, bodies: list[int], table: int) -> list[int]:
-    """Remove what touches the table, also while it leans on the bin; the others remain."""
+    """Remove bodies that touch the table, even if they lean on the bin; returns the others."""
     kept = [body for body in bodies if not client.getContactPoints(body, table)]
     for body in set(bodies) - set(kept):
         client.removeBody(body)
@@ -133,7 +133,7 @@ def _remove_fallen(client: BulletClient, bodies: list[int], table: int) -> list[
 
 
 def _add_bin(client: BulletClient, bin: Bin) -> int:
-    """The tray on its table; returns the table."""
+    """Add the bin and its table; returns the table's body."""
     outer = np.array([bin.inner_width, bin.inner_depth]) / 2 + bin.wall_thickness
     _add_box(client, (0, 0, -bin.wall_thickness / 2), (*outer, bin.wall_thickness / 2))
     if bin.wall_height > 0:
@@ -142,7 +142,7 @@ def _add_bin(client: BulletClient, bin: Bin) -> int:
 
 
 def _add_walls(client: BulletClient, bin: Bin, bottom: float, top: float) -> list[int]:
-    """Four walls around the bin's inside."""
+    """Add four walls around the inside of the bin; returns their bodies."""
     half_x, half_y, thick = bin.inner_width / 2, bin.inner_depth / 2, bin.wall_thickness / 2
     middle, half_z = (bottom + top) / 2, (top - bottom) / 2
     walls = []
@@ -160,7 +160,7 @@ def _add_box(client: BulletClient, centre: tuple, half_extents: tuple) -> int:
 
 
 def collision_file(model: ObjectModel) -> Path:
-    """The object's approximate convex decomposition as an ``.obj`` file with one group a part.
+    """Path of the object's approximate convex decomposition, an ``.obj`` file with one group per part.
 
     Hollow objects stay hollow (V-HACD). The result is cached under ``$XDG_CACHE_HOME/active6d`` by the mesh's contents.
     """

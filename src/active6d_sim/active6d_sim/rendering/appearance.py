@@ -1,4 +1,4 @@
-"""What a scene looks like: colours, textures and lights. Geometry is elsewhere."""
+"""Appearance of a scene: colours, textures and lights."""
 
 from dataclasses import dataclass, replace
 
@@ -11,23 +11,25 @@ TEXTURE_SIZE = 512
 
 @dataclass(frozen=True)
 class Appearance:
-    """Colours are linear RGB in [0, 1]; directions point from the scene to the light (any length), in the world.
+    """Colours, textures and lights of a scene.
+
+    Colours are linear RGB in [0, 1]. Directions point from the scene to the light, in the world, with any length.
 
     Attributes:
-        object_color: of all instances; None takes the model's.
-        color_variation: standard deviation of each instance's own tint and brightness, relative.
-        shininess: strength of the highlight on objects, 0 is matt.
-        bin_color: of the tray.
-        table_color: of the table, before its texture.
+        object_color: of all instances; the model's colour when None.
+        color_variation: relative standard deviation of tint and brightness between instances.
+        shininess: strength of highlights on objects; 0 is matt.
+        bin_color: colour of the bin.
+        table_color: mean colour of the table.
         table_contrast: relative standard deviation of the table's texture.
-        grain: (across, along) smoothness of the table's texture in texels of 2 mm; unequal numbers look like wood.
-        key_direction: of the light that casts shadows.
-        key_color: its colour times strength.
-        fill_direction: of a second, shadowless light.
-        fill_color: its colour times strength.
-        ambient_color: of light from everywhere, dimmed in crevices.
+        grain: smoothness of the table's texture in both directions, texels of 2 mm; unequal numbers look like wood.
+        key_direction: direction of the light that casts shadows.
+        key_color: colour of that light times its strength.
+        fill_direction: direction of a second light without shadows.
+        fill_color: colour of that light times its strength.
+        ambient_color: colour of ambient light, which is weaker in crevices.
         backdrop: colour above the horizon.
-        seed: of the instances' tints and of the textures.
+        seed: seed of the instances' tints and of the textures.
     """
 
     object_color: tuple[float, float, float] | None = None
@@ -50,8 +52,8 @@ class Appearance:
         """Random lights, colours and textures, for training data.
 
         Args:
-            rng: source of randomness.
-            vary_object_color: how far the objects' hue and brightness may leave the model's colour, relative.
+            rng: random generator.
+            vary_object_color: relative deviation of the objects' hue and brightness from the model's colour.
         """
         azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(25, 85))
         key = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
@@ -73,7 +75,7 @@ class Appearance:
         )
 
     def with_seed(self, seed: int) -> "Appearance":
-        """The same look with other tints and textures."""
+        """The same appearance with other tints and textures."""
         return replace(self, seed=seed)
 
     def instance_colors(self, count: int, model_color: np.ndarray) -> np.ndarray:
@@ -85,7 +87,7 @@ class Appearance:
         return np.clip(base * brightness * tint, 0.01, 1.0).astype(np.float32)
 
     def textures(self) -> np.ndarray:
-        """(2, TEXTURE_SIZE, TEXTURE_SIZE) float32 factors that tile: the table's grain, and the bin's fine speckle."""
+        """(2, TEXTURE_SIZE, TEXTURE_SIZE) float32 tileable brightness factors: the table's grain, the bin's speckle."""
         rng = np.random.default_rng([self.seed, 2])
         table = sum(_tiling_noise(rng, np.multiply(self.grain, scale)) * weight for scale, weight in ((1, 1), (4, 0.7)))
         bin_speckle = 0.04 * _tiling_noise(rng, (1.0, 1.0))

@@ -34,16 +34,16 @@ _BACKDROP, _TABLE, _TRAY, _FIRST_INSTANCE = range(4)
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What a perfect camera sees.
+    """Images of a noise-free camera.
 
     Attributes:
         color: (H, W, 3) uint8 RGB; None where shading was not asked for.
-        depth: (H, W) float32 metres along z, NaN where nothing is.
+        depth: (H, W) float32 metres along z, NaN without surface.
         instance: (H, W) int16 index into ``Scene.T_world_all`` (ground truth's objects first), -1 elsewhere.
         normals: (H, W, 3) float32 unit surface normals in the camera frame, smooth over curved surfaces, facing the
-            camera; zero where nothing is.
+            camera; zero without surface.
         object_coordinates: (H, W, 3) float32 surface points in the frame of the pixel's object, metres, zero elsewhere;
-            None unless asked for.
+            None where they were not asked for.
     """
 
     color: np.ndarray | None
@@ -55,7 +55,7 @@ class RenderedView:
 
 @dataclass(frozen=True, eq=False)
 class _Soup:
-    """Triangles of the whole scene.
+    """All triangles of a scene.
 
     Attributes:
         vertices: (v, 3) float32, world.
@@ -74,11 +74,11 @@ class SceneRenderer:
     """Renders one scene from any camera.
 
     Args:
-        scene: what to render.
+        scene: the scene to render.
         model: its object; loaded by the scene's ``object_name`` when None.
-        appearance: colours and lights; the default look when None.
-        appearance_seed: of tints and textures, when ``appearance`` is None.
-        threads: of the ray caster, 0 for all cores.
+        appearance: colours and lights; the default appearance when None.
+        appearance_seed: seed of tints and textures if ``appearance`` is None.
+        threads: number of threads of the ray caster, 0 for one per core.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class SceneRenderer:
         self._soup = soup = _build_soup(self.model.mesh, scene)
         self._caster = o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._caster.add_triangles(soup.vertices, soup.faces)
-        # One row more than there are faces: the row of rays that hit nothing.
+        # The last row is for rays that hit nothing.
         self._corner_normals = np.concatenate([soup.normals[soup.faces], np.zeros((1, 3, 3), np.float32)])
         self._face_normals = np.ascontiguousarray(self._corner_normals[:, 0])
         self._material = np.append(soup.material, np.int16(_BACKDROP))
@@ -151,10 +151,14 @@ class SceneRenderer:
         )
 
     def instance_layers(self, T_world_camera: np.ndarray, camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels of each object: visible, and as if it were rendered alone.
+        """Count the pixels of each object: those that are visible, and those if it were rendered alone.
+
+        Args:
+            T_world_camera: (4, 4) pose of the optical frame.
+            camera: intrinsics.
 
         Returns:
-            (n + h,) counts of visible pixels, and (n + h,) counts of the whole silhouettes within the picture.
+            (n + h,) numbers of visible pixels, and (n + h,) numbers of pixels of the whole silhouettes in the image.
         """
         count = len(self.scene.T_world_all)
         directions = pixel_rays(camera).reshape(-1, 3) @ np.asarray(T_world_camera[:3, :3], np.float32).T
@@ -169,13 +173,16 @@ class SceneRenderer:
         return np.bincount(first[first >= 0], minlength=count), silhouettes.sum(axis=1)
 
     def sees(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """(p,) bool, whether nothing lies between (3,) ``eye`` and (p, 3) ``points`` on surfaces, all in the world."""
+        """(p,) bool, whether (p, 3) ``points`` on surfaces are visible from (3,) ``eye``; all in the world, metres."""
         directions = (points - eye).astype(np.float32)
-        # A hit at parameter 1 is the point itself; within 0.1 % is rounding, not an occluder.
+        # A hit at parameter 1 is the point itself; 0.1 % are allowed for rounding.
         return self._cast(eye.astype(np.float32), directions)[0] > 0.999
 
     def _cast(self, eye: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Directions with z = 1 in the camera frame make the ray's parameter the depth. Misses get the extra face."""
+        """(p,) ray parameter, (p,) face and (p, 2) barycentric coordinates of first hits; misses get the extra face.
+
+        For directions with z = 1 in the camera frame, the ray parameter is the depth.
+        """
         answer = self._caster.cast_rays(_rays(eye, directions), nthreads=self._threads)
         face = np.minimum(answer["primitive_ids"].numpy(), len(self._material) - 1)
         return answer["t_hit"].numpy(), face, answer["primitive_uvs"].numpy()
@@ -214,7 +221,7 @@ class SceneRenderer:
         material: np.ndarray,
         directions: np.ndarray,
     ) -> np.ndarray:
-        """(p, 3) uint8: ambient light dimmed in crevices, a shadowless fill light, a key light with hard shadows."""
+        """(p, 3) uint8 sRGB from ambient light with occlusion, a fill light without shadows and a key light with them."""
         look = self._look
         key, fill = (_unit(direction) for direction in (look.key_direction, look.fill_direction))
         facing_key = normals @ key
@@ -236,7 +243,7 @@ class SceneRenderer:
         return _TO_SRGB[np.minimum(light, len(_TO_SRGB) - 1, out=light).astype(np.int16)]
 
     def _texture(self, points: np.ndarray, material: np.ndarray) -> np.ndarray:
-        """(p,) brightness factor; walls are textured along x + z and y + z, which needs no parametrisation."""
+        """(p,) brightness factor; walls take their texture along x + z and y + z, so that no UV map is needed."""
         factor = np.ones(len(points), np.float32)
         ground = np.flatnonzero((material == _TABLE) | (material == _TRAY))
         x, y, z = points[ground].T
@@ -254,7 +261,7 @@ class SceneRenderer:
         directions: np.ndarray,
         key: np.ndarray,
     ) -> None:
-        """Blinn-Phong highlights of the key light on objects."""
+        """Add Blinn-Phong highlights of the key light on objects."""
         glossy = lit[material[lit] >= _FIRST_INSTANCE]
         view = -directions[glossy]
         half = view / np.linalg.norm(view, axis=1, keepdims=True) + key
@@ -265,7 +272,7 @@ class SceneRenderer:
     def _paint_backdrop(
         self, light: np.ndarray, points: np.ndarray, material: np.ndarray, directions: np.ndarray
     ) -> None:
-        """A plain backdrop that the table fades into with distance."""
+        """Paint a plain backdrop, into which the table fades with distance."""
         backdrop = np.array(self._look.backdrop, np.float32)
         light[material == _BACKDROP] = backdrop
         table = np.flatnonzero(material == _TABLE)
@@ -282,10 +289,10 @@ def visible_fractions(
     sphere: ViewSphere = ViewSphere(),
     camera: PinholeCamera = DEFAULT_CAMERA.scaled(0.25),
 ) -> np.ndarray:
-    """(M, n + h) share of each object's silhouette that is visible from each view of ``sphere``.
+    """(M, n + h) visible share of each object's silhouette from each of the M views of ``sphere``, in [0, 1].
 
-    Visible pixels over the pixels of the object rendered alone by the same camera; 0 where it is outside the picture.
-    A small picture is enough: at 160x120 a mug covers about 250 pixels.
+    The share is the number of visible pixels over that of the object rendered alone, and 0 for objects outside of the
+    image. A small image is enough: at 160x120 pixels a mug covers about 250 of them.
     """
     renderer = SceneRenderer(scene, model=model)
     layers = [renderer.instance_layers(sphere.pose(position), camera) for position in sphere.positions]
@@ -344,7 +351,7 @@ def _patch(
 
 
 def _table(bin: Bin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The table, fine near the bin, where its ambient occlusion changes."""
+    """The table; its mesh is fine near the bin, where ambient occlusion changes."""
     reach = min(1.5 * max(bin.inner_width, bin.inner_depth) / _TABLE_HALF_WIDTH, 0.9)
     lines = np.concatenate([[0.0], 0.5 + 0.5 * reach * np.linspace(-1, 1, 64), [1.0]])
     width = 2 * _TABLE_HALF_WIDTH
@@ -352,7 +359,7 @@ def _table(bin: Bin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _tray(bin: Bin) -> list:
-    """Floor, and for each of four sides the wall's inside, its outside and its rim."""
+    """The bin's floor, and the inside, outside and rim of each of its four walls."""
     half_x, half_y, thick, top = bin.inner_width / 2, bin.inner_depth / 2, bin.wall_thickness, bin.wall_height
     fine, coarse, single = np.linspace(0, 1, 48), np.linspace(0, 1, 10), np.linspace(0, 1, 2)
     patches = [_patch((-half_x, -half_y, 0), (2 * half_x, 0, 0), (0, 2 * half_y, 0), fine, fine)]
@@ -371,7 +378,7 @@ def _tray(bin: Bin) -> list:
 
 
 def _ambient_openness(caster: o3d.t.geometry.RaycastingScene, soup: _Soup, threads: int) -> np.ndarray:
-    """(v,) share of the hemisphere above each vertex, cosine-weighted, that is free within ``_OCCLUSION_REACH``."""
+    """(v,) cosine-weighted share of the hemisphere above each vertex that is free within ``_OCCLUSION_REACH``."""
     rng = np.random.default_rng(0)
     sphere = rng.normal(size=(_OCCLUSION_RAYS, 3)).astype(np.float32)
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)

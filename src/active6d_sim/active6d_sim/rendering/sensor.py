@@ -1,4 +1,4 @@
-"""What an active stereo camera makes of a perfect view: noise, holes, rough edges and rounding."""
+"""Model of an active stereo camera: noise, missing depth, rough edges and rounding of a noise-free view."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -19,16 +19,16 @@ class SensorNoise:
     Attributes:
         disparity: standard deviation of the matched disparity, pixels. Stereo triangulation turns it into a depth
             error of ``z^2 * disparity / (fx * baseline)``: 1.5 mm at 0.8 m for a VGA image.
-        baseline: distance of the two imagers, metres.
-        patch: side of the square over which the depth error is correlated, pixels; stereo matches windows, not pixels.
-        jitter: largest shift across the image of what a pixel measures, pixels; roughens edges.
+        baseline: distance between the two imagers, metres.
+        patch: side of the square over which depth errors are correlated, pixels; stereo matches windows.
+        jitter: largest distance between a pixel and the point that it measures, pixels; roughens edges.
         grazing_degrees: angle between ray and surface normal at which half of the returns are missing.
-        grazing_width_degrees: how gradually they go missing around it.
+        grazing_width_degrees: width of the transition around that angle.
         edge_step: jump in depth between neighbours, metres, that counts as an edge.
-        edge_loss: share of the pixels at edges without a return.
-        speckle_loss: share of all pixels without a return.
+        edge_loss: share of the pixels at edges that have no return.
+        speckle_loss: share of all pixels that have no return.
         quantum: depth is rounded to multiples of this, metres; 0 does not round.
-        color: standard deviation of each colour channel, in steps of 255.
+        color: standard deviation of each colour channel, in levels of 0 to 255.
 
     Raises:
         ValueError: a parameter is negative or not finite, or a share is above 1; the message names it.
@@ -58,9 +58,9 @@ class SensorNoise:
             raise ValueError("sensor noise: baseline, patch and grazing_width_degrees must be positive")
 
     def scaled(self, factor: float) -> "SensorNoise":
-        """The sensor with ``factor`` times the noise and losses of disparity, edges, speckle and colour.
+        """The sensor with ``factor`` times the noise of disparity and colour and the losses at edges and of speckle.
 
-        What comes of geometry and rounding (jitter, grazing angle, quantum) stays; only 0, a perfect sensor, has none.
+        Jitter, grazing angle and quantum are unchanged, except for factor 0, which gives a noise-free sensor.
         """
         if factor == 0:
             return SensorNoise.off()
@@ -74,7 +74,7 @@ class SensorNoise:
 
     @classmethod
     def off(cls) -> "SensorNoise":
-        """A perfect sensor."""
+        """A noise-free sensor."""
         return cls(
             disparity=0.0, jitter=0, grazing_degrees=180.0, edge_loss=0.0, speckle_loss=0.0, quantum=0.0, color=0.0
         )
@@ -86,10 +86,18 @@ class SensorNoise:
     def measure(
         self, rendered: RenderedView, camera: PinholeCamera, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Measure a perfect view.
+        """Simulate the measurement of a noise-free view.
+
+        Args:
+            rendered: the noise-free view, with colour.
+            camera: its intrinsics.
+            rng: random generator.
 
         Returns:
             (H, W, 3) uint8 colour, and (H, W) float32 depth in metres with NaN for missing returns.
+
+        Raises:
+            ValueError: the view has no colour.
         """
         if rendered.color is None:
             raise ValueError("the view was rendered without colour")
@@ -105,7 +113,7 @@ class SensorNoise:
 
 @register_sensor(DEFAULT_SENSOR)
 def active_stereo(model: ObjectModel) -> SensorNoise:
-    """The short-range active stereo camera; ``model`` makes no difference."""
+    """The short-range active stereo camera; it is the same for every model."""
     return SensorNoise()
 
 
@@ -123,7 +131,7 @@ def _loss(rendered: RenderedView, camera: PinholeCamera, noise: SensorNoise) -> 
 
 
 def _jittered(depth: np.ndarray, jitter: int, rng: np.random.Generator) -> np.ndarray:
-    """Each pixel measures what a neighbour at most ``jitter`` pixels away sees."""
+    """(H, W) depth in which each pixel takes the value of a random pixel at most ``jitter`` away."""
     if jitter == 0:
         return depth
     height, width = depth.shape
@@ -134,7 +142,7 @@ def _jittered(depth: np.ndarray, jitter: int, rng: np.random.Generator) -> np.nd
 
 
 def _correlated(shape: tuple[int, int], patch: int, rng: np.random.Generator) -> np.ndarray:
-    """Unit normal noise, averaged over squares of ``patch`` pixels and scaled back to unit variance."""
+    """Normal noise of unit variance, correlated over squares of ``patch`` pixels."""
     white = rng.standard_normal(shape, np.float32)
     return uniform_filter(white, patch, mode="wrap") * patch if patch > 1 else white
 

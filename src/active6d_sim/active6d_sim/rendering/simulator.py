@@ -1,4 +1,4 @@
-"""A camera in a scene, without ROS: what it sees from where, and which goals it accepts."""
+"""The simulated camera without ROS: its views, the goals that it accepts, and its travel times."""
 
 import numpy as np
 
@@ -14,44 +14,44 @@ NANOSECONDS = 1_000_000_000
 
 
 class GoalError(ValueError):
-    """A view goal that the camera cannot go to; the text says why."""
+    """The camera cannot reach a view goal; the text says why."""
 
 
 class Simulator:
-    """An RGB-D camera that can be put anywhere in a scene."""
+    """An RGB-D camera that can take a view from any pose in a scene."""
 
     def __init__(
         self, scene: Scene, camera: PinholeCamera = DEFAULT_CAMERA, noise: Sensor = SensorNoise(), seed: int = 0
     ) -> None:
         """
         Args:
-            scene: what there is to see.
+            scene: the scene.
             camera: intrinsics of both images.
             noise: of the sensor.
-            seed: of the sensor's noise and of the scene's looks.
+            seed: seed of the sensor's noise and of the scene's appearance.
         """
         self.scene, self.camera, self.noise, self.seed = scene, camera, noise, seed
         self.renderer = SceneRenderer(scene, appearance_seed=seed)
 
     def capture(self, T_world_camera: np.ndarray, stamp: int) -> View:
-        """The view from (4, 4) ``T_world_camera``; its noise depends on the seed and ``stamp`` (nanoseconds) alone."""
+        """Take a view from (4, 4) ``T_world_camera``; its noise depends on seed and ``stamp`` (nanoseconds) only."""
         return self.sense(self.renderer.render(T_world_camera, self.camera), T_world_camera, stamp, self.noise)
 
     def sense(self, rendered: RenderedView, T_world_camera: np.ndarray, stamp: int, noise: Sensor) -> View:
-        """What the sensor makes of a view rendered from (4, 4) ``T_world_camera``, with other noise than its own."""
+        """Simulate the measurement of a view that was rendered from (4, 4) ``T_world_camera``, by the given sensor."""
         rng = np.random.default_rng([self.seed, stamp])
         color, depth = noise.measure(rendered, self.camera, rng)
         return View(stamp, color, depth, self.camera, np.array(T_world_camera, float))
 
 
 def admit_goal(T_world_goal: np.ndarray, sphere: ViewSphere, *, snap: bool, tolerance: float) -> np.ndarray:
-    """Where the camera goes when it is asked to go to ``T_world_goal``.
+    """Check a view goal, and compute the pose that the camera moves to.
 
     Args:
         T_world_goal: (4, 4) pose of the optical frame.
         sphere: the hemisphere of views.
-        snap: to the grid's nearest view; otherwise exactly there.
-        tolerance: metres that a goal may be off the hemisphere.
+        snap: whether the camera moves to the nearest view of the grid instead of the exact goal.
+        tolerance: largest distance of a goal from the hemisphere, metres.
 
     Returns:
         (4, 4) ``T_world_camera``.

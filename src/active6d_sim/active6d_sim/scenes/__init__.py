@@ -1,1 +1,1 @@
-"""Scenes, and the stored ones with their train, validation and test splits."""
+"""Scenes, and the stored scenes with their splits for training, validation and test."""

@@ -11,13 +11,16 @@ from active6d_core.se3 import is_rigid
 
 @dataclass(frozen=True)
 class Bin:
-    """An open tray. Its floor is at z = 0; the table that it stands on is one wall thickness below.
+    """An open bin. Its floor is at z = 0, and the table is one wall thickness below.
 
     Attributes:
         inner_width: along world x, metres.
         inner_depth: along world y, metres.
-        wall_height: of the inner walls above the floor, metres; 0 is a plate without walls.
+        wall_height: height of the inner walls above the floor, metres; 0 for a plate without walls.
         wall_thickness: of walls and floor, metres.
+
+    Raises:
+        ValueError: a size is not positive and finite.
     """
 
     inner_width: float
@@ -32,7 +35,7 @@ class Bin:
 
     @classmethod
     def for_model(cls, model: ObjectModel) -> "Bin":
-        """The square bin that the model's usual number of instances lies in, see ``ObjectModel.bin_width``."""
+        """The square bin for the model's usual number of instances, see ``ObjectModel.bin_width``."""
         return cls(model.bin_width, model.bin_width, model.wall_height)
 
 
@@ -41,14 +44,14 @@ class Scene:
     """Identical objects at rest in a bin.
 
     Attributes:
-        object_name: of the object's description.
-        name: ``mug/test/3`` for a stored scene, ``mug/seed/7`` for one that was dropped on demand.
-        seed: of the drop.
-        T_world_object: (n, 4, 4) poses of the ground truth's objects, metres.
-        bin: the tray they lie in.
+        object_name: name of the object.
+        name: ``mug/test/3`` for a stored scene, ``mug/seed/7`` for one that was simulated on demand.
+        seed: seed of the simulation.
+        T_world_object: (n, 4, 4) true poses of the objects, metres.
+        bin: the bin that they lie in.
         visible_fraction: (M, n) share of each object's silhouette seen from each view of the default grid, in [0, 1].
-        T_world_hidden: (h, 4, 4) poses of objects that are physically there (and rendered) but belong to no ground
-            truth, since no view of the grid shows enough of them.
+        T_world_hidden: (h, 4, 4) poses of objects that are simulated and rendered, but do not belong to the ground
+            truth because no view of the grid shows enough of them.
 
     Raises:
         ValueError: shapes disagree or a pose is not rigid.
@@ -75,7 +78,7 @@ class Scene:
 
     @property
     def T_world_all(self) -> np.ndarray:
-        """(n + h, 4, 4) poses of everything in the bin, the ground truth's objects first."""
+        """(n + h, 4, 4) poses of all objects in the bin, those of the ground truth first."""
         return np.concatenate([self.T_world_object, self.T_world_hidden])
 
     def save(self, path: Path) -> None:
@@ -109,5 +112,5 @@ class Scene:
                     data["visible_fraction"],
                     data["T_world_hidden"],
                 )
-        except Exception as error:  # numpy raises many kinds on damaged archives
+        except Exception as error:  # NumPy raises many kinds of errors on damaged archives
             raise ValueError(f"{path}: not a stored scene ({error})") from error

@@ -1,7 +1,7 @@
-"""Stored scenes: 40 heaps an object, split once and for all into scenes to train, to validate and to test on.
+"""Stored scenes: 40 heaps per object in fixed splits for training, validation and test.
 
-Seeds of stored scenes are ``SPLIT_SEEDS[split] + index``; they are shipped as small ``.npz`` files, so that everybody
-evaluates on the same heaps whatever their physics engine's version.
+The seed of a stored scene is ``SPLIT_SEEDS[split] + index``. The scenes are shipped as small ``.npz`` files, so that
+evaluations use the same heaps with every version of the physics engine.
 """
 
 import os
@@ -16,30 +16,30 @@ import numpy as np
 from active6d_core.files import atomic_file
 from active6d_core.object_model import list_objects, load_object
 from active6d_core.view_sphere import ViewSphere
-from active6d_sim.physics.heap import collision_file, drop_heap
+from active6d_sim.physics.heap import collision_file, simulate_heap
 from active6d_sim.scenes.scene import Scene
 
-#: Scenes per split: 30 to train (of which 6 validate) and 10 to test, as in the paper.
+#: Scenes per split: 30 for training (6 of them for validation) and 10 for test, as in the paper.
 SPLITS = {"train": 24, "val": 6, "test": 10}
 SPLIT_SEEDS = {"train": 100_000, "val": 200_000, "test": 300_000}
-#: Heaps dropped on demand use seeds below this, so that none of them is a stored one.
+#: Heaps that are simulated on demand have smaller seeds than this, so that none of them is a stored one.
 FIRST_STORED_SEED = min(SPLIT_SEEDS.values())
 
 SHIPPED_SCENES = Path(__file__).parent / "stored"
 
 
 def scene_path(object_name: str, split: str, index: int) -> Path:
-    """Where a stored scene lies: in a folder of ``ACTIVE6D_SCENE_PATH`` that has it, else among the shipped ones."""
+    """Path of a stored scene: in a folder of ``ACTIVE6D_SCENE_PATH`` that has it, else among the shipped ones."""
     relative = Path(object_name) / f"{split}_{index:02d}.npz"
     extra = [Path(folder) for folder in os.environ.get("ACTIVE6D_SCENE_PATH", "").split(os.pathsep) if folder]
     return next((folder / relative for folder in extra if (folder / relative).is_file()), SHIPPED_SCENES / relative)
 
 
 def load_scene(object_name: str, split: str, index: int) -> Scene:
-    """A stored scene.
+    """Load a stored scene.
 
     Raises:
-        ValueError: there is no such object or scene, the message says which there are; or its file is damaged.
+        ValueError: there is no such object or scene (the message lists the known ones), or the file is damaged.
     """
     if split not in SPLITS or not 0 <= index < SPLITS[split]:
         known = ", ".join(f"{name}/0..{count - 1}" for name, count in SPLITS.items())
@@ -58,15 +58,15 @@ def load_scene(object_name: str, split: str, index: int) -> Scene:
 
 
 def find_scene(object_name: str, name: str, seed: int) -> Scene:
-    """The stored scene called ``name`` (``mug/test/3``, or ``test/3``), or without a name a heap dropped by ``seed``.
+    """Load the stored scene ``name`` (``mug/test/3`` or ``test/3``); without a name, simulate a heap from ``seed``.
 
     Raises:
-        ValueError: the name is not of this form or of another object, or the seed is a stored scene's.
+        ValueError: the name has another form or another object, or the seed belongs to a stored scene.
     """
     if not name:
         if not 0 <= seed < FIRST_STORED_SEED:
             raise ValueError(f"seed must be within 0 and {FIRST_STORED_SEED - 1} (others are stored), got {seed}")
-        return drop_heap(load_object(object_name), seed)
+        return simulate_heap(load_object(object_name), seed)
     parts = name.removeprefix(f"{object_name}/").split("/")
     if len(parts) != 2 or not parts[1].isdecimal():
         raise ValueError(f"scene '{name}' is not of the form {object_name}/test/3")
@@ -76,7 +76,13 @@ def find_scene(object_name: str, name: str, seed: int) -> Scene:
 def generate(
     object_name: str, folder: Path, *, splits: tuple[str, ...] = tuple(SPLITS), workers: int | None = None
 ) -> Iterator[Path]:
-    """Drop and store every scene of an object that is not there yet, on all cores; yields each file as it is done.
+    """Simulate and store the missing scenes of an object on several cores; yields each file when it is finished.
+
+    Args:
+        object_name: name of the object.
+        folder: folder to write to, with a folder per object.
+        splits: names of the splits.
+        workers: number of processes, one per core when None.
 
     Raises:
         ValueError: an unknown object or split.
@@ -92,15 +98,15 @@ def generate(
                 missing.append((object_name, split, index, path))
     if not missing:
         return
-    collision_file(load_object(object_name))  # once, before every process makes its own
-    # Forking a process whose ray caster has started its threads would hang.
+    collision_file(load_object(object_name))  # once, so that not every process computes it
+    # A fork of a process in which the ray caster has started its threads would hang.
     with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn")) as pool:
         for done in as_completed([pool.submit(_store_scene, *job) for job in missing]):
             yield done.result()
 
 
 def _store_scene(object_name: str, split: str, index: int, path: Path) -> Path:
-    scene = drop_heap(load_object(object_name), SPLIT_SEEDS[split] + index, name=f"{object_name}/{split}/{index}")
+    scene = simulate_heap(load_object(object_name), SPLIT_SEEDS[split] + index, name=f"{object_name}/{split}/{index}")
     with atomic_file(path) as unfinished:
         replace(scene, visible_fraction=np.round(scene.visible_fraction, 3)).save(unfinished)
     return path
@@ -109,17 +115,17 @@ def _store_scene(object_name: str, split: str, index: int, path: Path) -> Path:
 def density_report(
     scenes: list[Scene], rng: np.random.Generator, *, moves: int = 5, starts: int = 20
 ) -> dict[str, float]:
-    """How much the choice of views matters: shares of objects that at least one taken view shows at least half of.
+    """Measure how much the choice of views matters, by the share of objects that some view shows at least half of.
 
     Args:
         scenes: stored scenes of one object.
-        rng: of the random views and starting azimuths.
-        moves: T; T + 1 views are taken.
-        starts: random draws per scene.
+        rng: random generator of views and starting azimuths.
+        moves: number of moves T; T + 1 views are taken.
+        starts: number of random starts per scene.
 
     Returns:
-        ``one_view``, ``random`` (T + 1 random views), ``revolution`` (evenly around at 45 degrees), ``oracle`` (greedy,
-        knows what each view shows) and ``all_views``; means over the scenes' objects, starts and scenes.
+        Means over objects, starts and scenes: ``one_view``, ``random`` (T + 1 random views), ``revolution`` (evenly
+        spaced at 45 degrees), ``oracle`` (greedy, with knowledge of what each view shows) and ``all_views``.
     """
     sphere = ViewSphere()
     shares: dict[str, list[float]] = {name: [] for name in ("one_view", "random", "revolution", "oracle", "all_views")}
@@ -139,7 +145,7 @@ def density_report(
 
 
 def _greedy(seen: np.ndarray, start: int, moves: int) -> np.ndarray:
-    """(n,) which objects are seen after ``moves`` moves, each to the view that shows most of those not seen yet."""
+    """(n,) bool, which objects are seen after ``moves`` moves, each to the view that shows most unseen objects."""
     found = seen[start].copy()
     for _ in range(moves):
         found |= seen[np.argmax((seen & ~found).sum(axis=1))]

@@ -102,11 +102,11 @@ def prepare_views(
 
     The pile has ``objects`` instances, by default two fewer than the maximum of the object.
     """
-    from active6d_sim.physics.heap import drop_heap
+    from active6d_sim.physics.heap import simulate_heap
     from active6d_sim.rendering.renderer import SceneRenderer
 
     model, sphere, rng = load_object(object_name), ViewSphere(), np.random.default_rng(seed)
-    scene = drop_heap(model, seed, count=objects or model.instances[1] - 2)
+    scene = simulate_heap(model, seed, count=objects or model.instances[1] - 2)
     renderer = SceneRenderer(scene)
     views, found = [], {}
     for index, position in enumerate(rng.permutation(len(sphere))[:count]):
