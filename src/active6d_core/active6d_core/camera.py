@@ -1,4 +1,4 @@
-"""The pinhole camera, one registered RGB-D view, and what follows from a depth image."""
+"""The pinhole camera, one registered RGB-D view, and points and normals from a depth image."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,14 +29,14 @@ class PinholeCamera:
             raise ValueError(f"camera size must be positive, got {self.width}x{self.height}")
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() or self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"camera focal lengths must be positive and finite, got fx={self.fx} fy={self.fy}")
-        # numpy promotes float32 images by an np.float64 and not by a float: results must not depend on where the
-        # numbers came from.
+        # NumPy promotes float32 images by an np.float64 but not by a float. With plain floats results do not depend on
+        # the type that the caller had.
         for name in ("fx", "fy", "cx", "cy"):
             object.__setattr__(self, name, float(getattr(self, name)))
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal_degrees: float) -> "PinholeCamera":
-        """Square pixels, principal point at the image's centre."""
+        """A camera with square pixels and the principal point at the image's centre; sizes in pixels."""
         focal = 0.5 * width / np.tan(0.5 * np.radians(horizontal_degrees))
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 

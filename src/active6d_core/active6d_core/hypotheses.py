@@ -1,4 +1,4 @@
-"""What an estimator says of one view, and what fusion says of the scene: struct-of-arrays tables."""
+"""Tables of the pose hypotheses of one view and of the fused objects of a scene, as structs of arrays."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -12,11 +12,11 @@ class Hypotheses:
 
     Attributes:
         T_camera_object: (k, 4, 4) poses in the optical frame, metres.
-        score: (k,) the estimator's own confidence in [0, 1]; ranks hypotheses.
+        score: (k,) confidence of the estimator in [0, 1]; ranks hypotheses.
         box: (k, 4) x_min, y_min, x_max, y_max of the mask over image width and height, in [0, 1] (paper: b).
         depth: (k,) mean depth over the mask in metres (paper: d).
-        label: (k,) uint16, the hypothesis's value in ``segmentation``, from 1; several hypotheses may share a label
-            when they are alternatives for one instance.
+        label: (k,) uint16, value of the hypothesis in ``segmentation``, from 1; hypotheses that are alternatives for
+            one instance share a label.
         segmentation: (H, W) uint16 label per pixel, 0 for background.
 
     Raises:
@@ -52,14 +52,14 @@ class Hypotheses:
         segmentation: np.ndarray,
         depth_image: np.ndarray,
     ) -> "Hypotheses":
-        """Build the table; boxes and mean depths are measured from the masks (paper, "Objects feature representation").
+        """Build the table, with boxes and depths from the masks (paper, "Objects feature representation").
 
         Args:
-            T_camera_object: (k, 4, 4).
-            score: (k,).
+            T_camera_object: (k, 4, 4) poses in the optical frame, metres.
+            score: (k,) in [0, 1].
             label: (k,) labels that occur in ``segmentation``.
-            segmentation: (H, W) uint16.
-            depth_image: (H, W) metres, NaN invalid; a mask without valid depth gets the pose's own z.
+            segmentation: (H, W) uint16 label per pixel, 0 for background.
+            depth_image: (H, W) metres along z, NaN invalid; a mask without valid depth takes the z of the pose.
 
         Raises:
             ValueError: a label has no pixel.
@@ -95,7 +95,7 @@ class Hypotheses:
 
     @classmethod
     def empty(cls, height: int, width: int) -> "Hypotheses":
-        """No hypothesis, for an image of the given size in pixels."""
+        """A table without hypotheses, for an image of the given size in pixels."""
         none = np.zeros(0)
         return cls(
             np.zeros((0, 4, 4)),
@@ -113,12 +113,15 @@ class SceneObjects:
 
     Attributes:
         T_world_object: (n, 4, 4) poses in the world, metres.
-        verification: (n,) verification score c of the surviving hypothesis, from the view it was seen in (equation 1).
-        score: (n,) the estimator's confidence of the surviving hypothesis.
+        verification: (n,) verification score c (equation 1) of the selected hypothesis, in the view that it is from.
+        score: (n,) score of the selected hypothesis in [0, 1].
         box: (n, 4) normalised box in the current camera (paper: b), re-projected for objects not seen in this view.
         depth: (n,) metres along z in the current camera (paper: d).
         support: (n,) int, number of views with a hypothesis in the object's cluster.
-        spread: (n,) metres, how far apart the cluster's hypotheses place the model's points (0 with one hypothesis).
+        spread: (n,) largest distance between the cluster's hypotheses, metres (0 with one hypothesis).
+
+    Raises:
+        ValueError: array shapes disagree.
     """
 
     T_world_object: np.ndarray
@@ -142,7 +145,7 @@ class SceneObjects:
 
     @classmethod
     def empty(cls) -> "SceneObjects":
-        """No object."""
+        """A table without objects."""
         none = np.zeros(0)
         return cls(np.zeros((0, 4, 4)), none, none, np.zeros((0, 4)), none, np.zeros(0, int), none)
 

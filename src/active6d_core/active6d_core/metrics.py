@@ -1,10 +1,11 @@
 """Pose errors by BOP's names and formulas, and the paper's score of a scene.
 
-Every error takes ``T_est`` and ``T_gt`` whose leading dimensions broadcast: ``e_add(model, T_est[:, None], T_gt)`` is
-the (k, n) table of all pairs. Both poses are in one frame, metres. Symmetries come from the model: an error is the
-least one over the object's symmetry group, and a continuous axis is searched, not sampled: see
-:func:`_least_over_symmetries`. Formulas: Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", and
-Hinterstoisser et al. for ADD; conventions as in the paper's "Evaluation metrics" and supplement D.
+The leading dimensions of ``T_est`` and ``T_gt`` broadcast: ``e_add(model, T_est[:, None], T_gt)`` is the (k, n) table
+of all pairs. Both poses are in one frame, in metres. An error is the least one over the object's symmetry group. For a
+continuous axis the minimum is searched for and not sampled, see :func:`_least_over_symmetries`.
+
+Formulas: Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", and Hinterstoisser et al. for ADD. Conventions
+are those of the paper, "Evaluation metrics" and supplement D. The paper writes e_ADD for ADD with symmetries.
 """
 
 from collections.abc import Callable
@@ -20,9 +21,9 @@ from active6d_core.camera import PinholeCamera, project
 from active6d_core.object_model import ObjectModel, Symmetry
 from active6d_core.se3 import invert, make_transform, transform_points
 
-#: Metres charged for an object without a matched hypothesis, and the most that any object is (paper, supplement D).
+#: Error in metres of an object without a matched hypothesis, and the largest of any object (paper, supplement D).
 MISSED_E_ADD = 0.05
-#: An object is detected when its e_ADD is below this fraction of the diameter (paper, "Evaluation metrics").
+#: An object is detected if its ADD is below this fraction of the diameter (paper, "Evaluation metrics").
 DETECTION_FRACTION = 0.1
 
 _METRE_TOLERANCE = 5e-5
@@ -32,16 +33,19 @@ _CHUNK = 1_000_000
 
 
 def e_add(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, *, cutoff: float = np.inf) -> np.ndarray:
-    """Average distance of model points: min over S of mean over x of ``||T_est x - T_gt S x||``.
+    """ADD with symmetries: min over S of mean over x of ``||T_est x - T_gt S x||``.
 
     Args:
-        model: its ``error_points`` are averaged over.
+        model: the object; x are its ``error_points``, S its symmetries.
         T_est: (..., 4, 4) estimated poses.
         T_gt: (..., 4, 4) true poses, broadcast against ``T_est``.
-        cutoff: metres; an error known to be above it may come back as ``inf`` instead, which saves most of a table.
+        cutoff: metres; larger errors may be returned as ``inf``, which saves most of the work on a table.
 
     Returns:
         (...,) metres, at most 0.05 mm too large for a continuous symmetry, otherwise exact.
+
+    Raises:
+        ValueError: a pose is not finite.
     """
     return _point_error(model, T_est, T_gt, np.mean, cutoff)
 
@@ -55,10 +59,10 @@ def mssd(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, *, cutoff: flo
 
 
 def mspd(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, camera: PinholeCamera) -> np.ndarray:
-    """Maximum symmetry-aware projection distance (BOP): min over S of max over x of the distance of both projections.
+    """Maximum symmetry-aware projection distance (BOP): min over S of max over x of the distance in the image.
 
     Args:
-        model: its ``error_points`` are projected.
+        model: the object; x are its ``error_points``, S its symmetries.
         T_est: (..., 4, 4) estimated poses in the optical frame.
         T_gt: (..., 4, 4) true poses in the optical frame, broadcast against ``T_est``.
         camera: intrinsics.
@@ -75,7 +79,8 @@ def mspd(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, camera: Pinhol
     T_est, T_gt = T_est[in_front], T_gt[in_front]
     nearest = T_gt[:, 2, 3] - reach
     slant = (np.linalg.norm(T_gt[:, :2, 3], axis=1) + reach) / nearest
-    # A point moves by at most its axis distance times the angle; its image by that over depth, more off the axis.
+    # A point moves by at most its distance from the axis times the angle. Its image moves by that over the depth, and
+    # by more away from the principal point.
     lipschitz = max(camera.fx, camera.fy) * geometry.axis_distance.max() / nearest * np.hypot(1.0, slant)
 
     def evaluate(pair: np.ndarray, S: np.ndarray) -> np.ndarray:
@@ -94,9 +99,9 @@ def mspd(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, camera: Pinhol
 
 
 def add_s(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, *, cutoff: float = np.inf) -> np.ndarray:
-    """ADD-S (BOP's ADI): mean over points x at the true pose of the distance to the nearest point at the estimate.
+    """ADD-S (ADI in BOP): mean over points at the true pose of the distance to the nearest point at the estimate.
 
-    Arguments as for :func:`e_add`; the model's symmetries play no part.
+    Arguments and errors as for :func:`e_add`; the model's symmetries are not used.
 
     Returns:
         (...,) metres.
@@ -104,7 +109,7 @@ def add_s(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, *, cutoff: fl
     leading, T_est, T_gt = _flatten(T_est, T_gt)
     geometry = _geometry(model)
     errors = np.full(len(T_est), np.inf)
-    # The nearest points' mean distance is no shorter than the way from the true centroid to the estimate's hull.
+    # The mean distance is at least the distance of the true centroid from the convex hull at the estimate.
     centroid = (
         transform_points(T_gt, geometry.centroid[None])[:, 0] - transform_points(T_est, geometry.centroid[None])[:, 0]
     )
@@ -115,14 +120,14 @@ def add_s(model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, *, cutoff: fl
 
 
 def match(errors: np.ndarray, missed: float = MISSED_E_ADD) -> np.ndarray:
-    """One-to-one assignment of hypotheses to objects with the least total error.
+    """Find the one-to-one assignment of hypotheses to objects with the least total error.
 
     Args:
         errors: (k, n) error of each hypothesis against each object; ``inf`` is allowed.
-        missed: what an object without a hypothesis costs; a pair at or above it is no match.
+        missed: error of an object without a hypothesis; pairs match only if their error is below this.
 
     Returns:
-        (n,) index of each object's hypothesis, -1 without one.
+        (n,) index of each object's hypothesis, -1 without a match.
 
     Raises:
         ValueError: an error is NaN.
@@ -130,7 +135,7 @@ def match(errors: np.ndarray, missed: float = MISSED_E_ADD) -> np.ndarray:
     if np.isnan(errors).any():
         raise ValueError("match: errors contain NaN")
     matched = np.full(errors.shape[1], -1)
-    # Every hypothesis spared costs `missed`, so with the costs clipped there a full assignment is also the best one.
+    # With costs clipped at `missed`, a pair at that cost is the same as no match, so a full assignment is optimal.
     rows, columns = linear_sum_assignment(np.minimum(errors, missed))
     good = errors[rows, columns] < missed
     matched[columns[good]] = rows[good]
@@ -139,12 +144,12 @@ def match(errors: np.ndarray, missed: float = MISSED_E_ADD) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SceneScore:
-    """The paper's measures of n true objects.
+    """The paper's scores of n true objects.
 
     Attributes:
-        e_add_mm: (n,) millimetres; 50 for an object without a hypothesis, and never more.
-        matched: (n,) index of each object's hypothesis, -1 without one.
-        detected: (n,) bool, e_ADD below 10 % of the diameter.
+        e_add_mm: (n,) ADD in millimetres, at most 50, which is the value of an object without a hypothesis.
+        matched: (n,) index of each object's hypothesis, -1 without a match.
+        detected: (n,) bool, whether ADD is below 10 % of the diameter.
     """
 
     e_add_mm: np.ndarray
@@ -163,7 +168,12 @@ class SceneScore:
 
 
 def score_errors(errors: np.ndarray, diameter: float, missed: float = MISSED_E_ADD) -> SceneScore:
-    """:func:`evaluate_scene` from a (k, n) table of e_ADD in metres; entries from ``missed`` on may be ``inf``.
+    """As :func:`evaluate_scene`, from a table of errors.
+
+    Args:
+        errors: (k, n) ADD in metres; entries from ``missed`` on may be ``inf``.
+        diameter: the object's, metres.
+        missed: error of an object without a hypothesis, metres.
 
     Raises:
         ValueError: the table has no object, or contains NaN.
@@ -180,13 +190,13 @@ def score_errors(errors: np.ndarray, diameter: float, missed: float = MISSED_E_A
 def evaluate_scene(
     model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, *, missed: float = MISSED_E_ADD
 ) -> SceneScore:
-    """Score estimates against the truth: e_ADD, one-to-one, an object without a match charged ``missed``.
+    """Score estimated poses against the true ones: ADD after one-to-one matching.
 
     Args:
         model: the object.
         T_est: (k, 4, 4) estimated poses in any frame.
         T_gt: (n, 4, 4) true poses in that frame, n > 0.
-        missed: metres.
+        missed: error of an object without a hypothesis, metres.
 
     Raises:
         ValueError: there is no true object, or a pose is not finite.
@@ -196,9 +206,9 @@ def evaluate_scene(
 
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """What the errors need of a model's n error points.
+    """Precomputed quantities of a model's n error points.
 
-    ``monomials`` (10, n) are the products of x, y, z, 1: with them a squared distance is one matrix product, because
+    ``monomials`` (10, n) are the products of x, y, z, 1. With them squared distances are one matrix product, because
     ``||A x + t||^2`` is a quadratic form in (x, 1).
     """
 
@@ -234,7 +244,7 @@ def _geometry(model: ObjectModel) -> _Geometry:
 
 
 def _flatten(T_est: np.ndarray, T_gt: np.ndarray) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
-    """Broadcast both to one list of pairs; returns the leading shape and two (m, 4, 4)."""
+    """Broadcast both to one list of m pairs; returns the leading shape and two (m, 4, 4) arrays."""
     T_est, T_gt = np.broadcast_arrays(T_est, T_gt)
     if not (np.isfinite(T_est).all() and np.isfinite(T_gt).all()):
         raise ValueError("pose errors need finite poses")
@@ -242,7 +252,7 @@ def _flatten(T_est: np.ndarray, T_gt: np.ndarray) -> tuple[tuple[int, ...], np.n
 
 
 def _chunks(count: int, width: int) -> list[slice]:
-    """Slices of ``range(count)`` small enough that a (slice, width) table stays in the cache's neighbourhood."""
+    """Slices of ``range(count)`` small enough that a (slice, width) table is about as large as the cache."""
     size = max(1, _CHUNK // width)
     return [slice(start, start + size) for start in range(0, count, size)]
 
@@ -254,7 +264,7 @@ def _point_error(
     leading, T_est, T_gt = _flatten(T_est, T_gt)
     geometry = _geometry(model)
     relative = invert(T_gt) @ T_est
-    # Mean and maximum are both no less than the distance of the centroids, which S moves by at most centroid_play.
+    # Mean and maximum are at least the distance of the centroids, which S changes by at most centroid_play.
     shift = np.linalg.norm(transform_points(relative, geometry.centroid[None])[:, 0] - geometry.centroid, axis=1)
     near = shift - geometry.centroid_play <= cutoff
     relative = relative[near, :3]
@@ -284,17 +294,17 @@ def _least_over_symmetries(
 ) -> np.ndarray:
     """Minimum of an error over the symmetry group, for m pairs at once.
 
-    About a continuous axis this is branch and bound: an error changes by at most ``lipschitz`` per radian, so an
-    interval of angles whose middle lies too high cannot hold the minimum; the others are cut in four until no interval
-    can improve the best value by more than ``tolerance``. That is a guarantee, which sampling gives only at steps so
-    fine (0.2 degrees for a cup) that it costs a hundred times as much.
+    For a continuous axis this is branch and bound. An error changes by at most ``lipschitz`` per radian, so an interval
+    of angles whose middle has a large error cannot contain the minimum. The other intervals are cut in four, until none
+    can improve the best value by more than ``tolerance``. Sampling with the same guarantee needs steps of 0.2 degrees
+    for a cup, which takes a hundred times as long.
 
     Args:
         symmetry: the group.
         evaluate: (q,) indices of pairs and (q, 3, 3) rotations to (q,) errors.
-        lipschitz: (m,) most that a pair's error changes per radian about the axis.
-        tolerance: of the result, in the error's unit.
-        cutoff: errors above it need not be exact.
+        lipschitz: (m,) largest change of a pair's error per radian about the axis.
+        tolerance: of the result, in the unit of the error.
+        cutoff: larger errors need not be exact.
 
     Returns:
         (m,) errors.

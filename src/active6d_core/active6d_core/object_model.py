@@ -1,4 +1,4 @@
-"""Object models: one YAML description a file, with its mesh, instance range and symmetries.
+"""Object models: mesh, number of instances, symmetries and named parts, from one YAML file per object.
 
 Descriptions are found by name in the folders of ``ACTIVE6D_OBJECT_PATH`` (separated as in ``PATH``), then among those
 shipped with this package, so adding an object is adding a file. ``objects/README.md`` explains every key.
@@ -24,18 +24,18 @@ _LARGEST_GROUP = 120
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """Rotations about the object's origin that leave it looking the same.
+    """Rotations about the object's origin that do not change its appearance.
 
     Attributes:
-        axis: (3,) unit axis of a continuous symmetry, None without one.
-        discrete: (s, 3, 3) proper rotations of a finite symmetry group, the identity among them.
+        axis: (3,) unit axis of a continuous symmetry, None without such an axis.
+        discrete: (s, 3, 3) rotations of a finite symmetry group, including the identity.
     """
 
     axis: np.ndarray | None
     discrete: np.ndarray
 
     def rotations(self, step_degrees: float = 1.0) -> np.ndarray:
-        """(s, 3, 3) the whole group, a continuous axis sampled every ``step_degrees`` (BOP's convention)."""
+        """(s, 3, 3) rotations of the whole group; a continuous axis is sampled every ``step_degrees``, as in BOP."""
         if self.axis is None:
             return self.discrete
         angles = np.radians(np.arange(0.0, 360.0, step_degrees))
@@ -52,10 +52,10 @@ class ObjectModel:
         mesh: triangle mesh in the object frame.
         diameter: largest distance between two vertices, metres.
         symmetry: of shape and colour together.
-        instances: fewest and most instances in a scene.
+        instances: smallest and largest number of instances in a scene.
         color: (3,) RGB in [0, 1].
-        features: name to (2, 3) axis-aligned box (min, max) in the object frame, naming a part of the surface
-            (the mug's ``handle``) whose visibility decides whether the pose is ambiguous.
+        features: named parts of the surface, such as the mug's ``handle``, whose visibility decides whether the pose is
+            ambiguous: name to (2, 3) axis-aligned box (min, max) in the object frame, metres.
         origin: (3,) the object frame's origin in the frame of the mesh file, metres.
     """
 
@@ -79,13 +79,13 @@ class ObjectModel:
 
     @cached_property
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """(8192, 3) points spread evenly over the surface, and their (8192, 3) outward unit normals. Seeded."""
+        """(8192, 3) random surface points with a fixed seed, metres, and their (8192, 3) outward unit normals."""
         points, faces = trimesh.sample.sample_surface(self.mesh, 8192, seed=0)
         return np.asarray(points), np.asarray(self.mesh.face_normals[faces])
 
     @cached_property
     def error_points(self) -> np.ndarray:
-        """(n, 3) model points that pose errors average over: the vertices, or 2000 surface points if fewer."""
+        """(n, 3) points for pose errors, metres: the vertices, or 2000 surface points if there are fewer vertices."""
         vertices = np.asarray(self.mesh.vertices)
         return vertices if len(vertices) >= 2000 else self.surface[0][:2000]
 
@@ -93,8 +93,8 @@ class ObjectModel:
     def bin_width(self) -> float:
         """Side of the square bin in which the usual number of instances lies one and a half to two layers deep, metres.
 
-        0.625 diameters times the root of that number: then objects hide each other, but the heap neither towers nor
-        leaves the default camera's picture (measured in `docs/scenes.md`).
+        It is 0.625 diameters times the root of that number. Then objects hide each other, but the heap is neither too
+        high nor larger than the default camera's image (measured in ``docs/scenes.md``).
         """
         return round(0.625 * self.diameter * float(np.sqrt(np.mean(self.instances))), 2)
 
@@ -104,7 +104,7 @@ class ObjectModel:
         return round(0.6 * self.diameter, 3)
 
     def feature_mask(self, feature: str, points: np.ndarray) -> np.ndarray:
-        """Which of (n, 3) ``points`` in the object frame belong to the named part: (n,) bool."""
+        """(n,) bool, which of (n, 3) ``points`` in the object frame, metres, belong to the named part."""
         low, high = self.features[feature]
         return ((points >= low) & (points <= high)).all(axis=-1)
 
@@ -168,13 +168,13 @@ def read_description(path: Path) -> ObjectModel:
 
 
 def search_folders() -> list[Path]:
-    """Where descriptions are looked for, in this order: ``ACTIVE6D_OBJECT_PATH``, then what ships."""
+    """Folders with descriptions in the order of search: ``ACTIVE6D_OBJECT_PATH``, then the shipped ones."""
     extra = os.environ.get("ACTIVE6D_OBJECT_PATH", "")
     return [Path(folder) for folder in extra.split(os.pathsep) if folder] + [SHIPPED_OBJECTS]
 
 
 def find_beside(file_name: str, shipped: Path) -> Path:
-    """A file that goes with an object: beside the descriptions if it is there, else in ``shipped``, there or not."""
+    """Path of a file of an object: beside the descriptions if it exists there, else in the folder ``shipped``."""
     beside = (folder / file_name for folder in search_folders())
     return next((path for path in beside if path.is_file()), shipped / file_name)
 
@@ -199,7 +199,7 @@ def _load_mesh(description: dict[str, Any], path: Path) -> tuple[trimesh.Trimesh
     mesh.apply_scale(scale)  # type: ignore[no-untyped-call]
     if not len(mesh.faces) or mesh.volume <= 0:
         raise ValueError("mesh has no faces, or its faces point inwards (negative volume)")
-    # With the origin at the mass centre, physics needs no inertial offset and rotation errors do not leak into ADD.
+    # With the origin at the centre of mass, physics needs no inertial offset, and ADD depends less on rotation errors.
     origin = np.array(mesh.center_mass)
     mesh.apply_translation(-origin)
     return mesh, origin
@@ -224,9 +224,9 @@ def _read_symmetry(description: dict[str, Any]) -> Symmetry:
 
 
 def _generate_group(generators: np.ndarray) -> np.ndarray:
-    """(s, 3, 3) every product of (g, 3, 3) generators, the identity first.
+    """(s, 3, 3) all products of (g, 3, 3) generators, the identity first.
 
-    An error that is the least over half a group would depend on which of two equal poses is called the truth.
+    The group must be complete. Otherwise an error would depend on which of two symmetric poses is the true one.
     """
     group = np.eye(3)[None]
     while True:

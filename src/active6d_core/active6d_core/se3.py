@@ -27,7 +27,7 @@ def invert(T: np.ndarray) -> np.ndarray:
 
 
 def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Map (..., n, 3) points through (..., 4, 4) transforms."""
+    """Transform (..., n, 3) points by (..., 4, 4) ``T_a_b`` from frame b to frame a."""
     return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
@@ -58,7 +58,7 @@ def rotation_angle(R_a: np.ndarray, R_b: np.ndarray) -> np.ndarray:
 
 
 def is_rigid(T: np.ndarray, tolerance: float = 1e-6) -> bool:
-    """Whether every (..., 4, 4) matrix is finite, orthonormal, right-handed and has the bottom row 0 0 0 1."""
+    """Whether all (..., 4, 4) matrices are finite, orthonormal and right-handed, with bottom row 0 0 0 1."""
     T = np.asarray(T, float)
     if T.shape[-2:] != (4, 4) or not np.isfinite(T).all():
         return False
@@ -71,7 +71,7 @@ def is_rigid(T: np.ndarray, tolerance: float = 1e-6) -> bool:
 def look_at(eye: np.ndarray, target: np.ndarray, up: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
     """``T_world_camera`` (4, 4) of an optical frame (z forward, x right, y down; REP-103) at ``eye`` facing ``target``.
 
-    Straight up or down, where ``up`` gives no direction, the image's top points to world +y.
+    If the view is along ``up``, the image's top points to world +y. Positions are in metres.
 
     Raises:
         ValueError: ``eye`` and ``target`` coincide.

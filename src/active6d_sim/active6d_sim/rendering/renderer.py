@@ -221,7 +221,7 @@ class SceneRenderer:
         material: np.ndarray,
         directions: np.ndarray,
     ) -> np.ndarray:
-        """(p, 3) uint8 sRGB from ambient light with occlusion, a fill light without shadows and a key light with them."""
+        """(p, 3) uint8 sRGB from ambient light with occlusion, a fill light, and a key light with hard shadows."""
         look = self._look
         key, fill = (_unit(direction) for direction in (look.key_direction, look.fill_direction))
         facing_key = normals @ key
