@@ -481,6 +481,7 @@ def test_training_and_deployment_move_alike(lookup, network, policy):
     assert measured[2] == pytest.approx(deployed.distance_m.mean())
 
 
+@pytest.mark.slow
 def test_it_learns_its_way_past_random_and_resumes(tmp_path):
     lookup = BatchedFusion(synthetic_bank("mug", scenes=3, objects=12))
     starts = all_starts(lookup, 100, 0)

@@ -48,6 +48,7 @@ def killer(graphs, victim, index=1):
     return kill
 
 
+@pytest.mark.slow
 def test_killed_estimator_comes_back_and_the_episode_ends_as_ever(graphs, tmp_path):
     events = []
     result = run_episode(settings(tmp_path / "bag"), killer(graphs, "pose_estimator"), events.append)
@@ -88,6 +89,7 @@ def spin(graph, seconds=20.0):
         graph.spin_once(0.05)
 
 
+@pytest.mark.slow
 def test_interrupt_closes_the_bag_and_ends_every_process(graphs, tmp_path):
     def interrupt(step):
         if step.index == 1:
@@ -98,6 +100,7 @@ def test_interrupt_closes_the_bag_and_ends_every_process(graphs, tmp_path):
     assert len(read_episode(tmp_path / "bag").steps) >= 2
 
 
+@pytest.mark.slow
 def test_nodes_die_with_a_killed_supervisor(graphs):
     script = (
         "import sys, time; from active6d_bringup.graph.composition import NODES, GraphDescription;"

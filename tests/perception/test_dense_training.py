@@ -278,6 +278,7 @@ def test_scale_is_learned_from_the_error(mug_view):
     assert losses[1] < min(losses[0], losses[2])
 
 
+@pytest.mark.slow
 def test_a_small_network_learns_a_view_by_heart(mug_view):
     """Every head's loss falls, and the axes and centres come out of a few hundred steps on one view."""
     torch.manual_seed(0)

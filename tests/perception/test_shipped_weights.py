@@ -27,6 +27,7 @@ def views(name):
             yield LabelledView(captured, scene.T_world_object, scene.visible_fraction[view])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDED)
 def test_shipped_weights_find_what_they_found(name):
     assert choose_estimator(name) == "dense"
