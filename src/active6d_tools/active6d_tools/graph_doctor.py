@@ -25,13 +25,13 @@ _RELIABILITIES = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 _DURABILITIES = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
 
 
-def examine_graph(domain: int | None = None, namespace: str = "", seconds: float = 4.0) -> Iterator[Check]:
+def examine_graph(domain: int | None = None, namespace: str = "", seconds: float = 6.0) -> Iterator[Check]:
     """Listen to a running graph for some seconds, then report on its nodes and topics.
 
     Args:
         domain: ROS domain, None for ``ROS_DOMAIN_ID`` or 0.
         namespace: of the graph's nodes and topics.
-        seconds: how long to listen; nodes send a heartbeat every second.
+        seconds: how long to listen: discovery takes some seconds, and nodes send a heartbeat every second.
     """
     domain = int(os.environ.get("ROS_DOMAIN_ID") or 0) if domain is None else domain
     context = Context()
@@ -40,9 +40,10 @@ def examine_graph(domain: int | None = None, namespace: str = "", seconds: float
     listener = _Listener(context, namespace)
     executor.add_node(listener)
     try:
-        _spin(executor, seconds / 3)
-        listener.subscribe()
-        _spin(executor, seconds * 2 / 3)
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            listener.subscribe()
+            executor.spin_once(timeout_sec=0.1)
         where = f"in domain {domain}, namespace /{namespace.strip('/')}"
         yield from _check_nodes(listener, where)
         yield from _check_topics(listener, seconds)
@@ -50,12 +51,6 @@ def examine_graph(domain: int | None = None, namespace: str = "", seconds: float
         executor.shutdown()
         listener.destroy_node()
         context.try_shutdown()
-
-
-def _spin(executor: SingleThreadedExecutor, seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        executor.spin_once(timeout_sec=0.1)
 
 
 class _Listener(Node):
@@ -69,14 +64,16 @@ class _Listener(Node):
         self.received: dict[str, int] = defaultdict(int)
         self.heartbeats: dict[str, DiagnosticStatus] = {}
         self.latched = {topic.name for topic in CONTRACT if topic.latched}
+        self._subscribed = {_DIAGNOSTICS}
         self.create_subscription(DiagnosticArray, _DIAGNOSTICS, self._on_diagnostics, 100)
 
     def subscribe(self) -> None:
-        """Subscribe to what has been discovered, with QoS that its publishers match: others would log a warning."""
+        """Subscribe to topics discovered since the last call, with QoS that their publishers match."""
         for topic in CONTRACT:
             offered = [end.qos_profile for end in self.publishers(self.topics[topic.name])]
-            if topic.name == _DIAGNOSTICS or not offered:
+            if topic.name in self._subscribed or not offered:
                 continue
+            self._subscribed.add(topic.name)
             package, _, name = topic.type.split("/")
             qos = QoSProfile(
                 depth=1,

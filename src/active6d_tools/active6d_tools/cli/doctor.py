@@ -20,7 +20,7 @@ def doctor(
         int | None, typer.Option(min=0, max=232, help="ROS domain of the graph; by default ROS_DOMAIN_ID or 0.")
     ] = None,
     namespace: Annotated[str, typer.Option(help="Namespace of the graph.")] = "",
-    seconds: Annotated[float, typer.Option(min=1.0, help="How long to listen to the graph.")] = 4.0,
+    seconds: Annotated[float, typer.Option(min=1.0, help="How long to listen to the graph.")] = 6.0,
     json_file: JsonFile = None,
 ) -> None:
     """Report what is installed, what is missing and how to fix it, and try the core path.
