@@ -201,7 +201,7 @@ def test_records_go_on_where_they_were_stopped(tmp_path):
     with pytest.raises(ValueError, match=r"records.jsonl: .* choose another file"):
         Records(path, {"object": "bunny"})
     path.write_text("no records\n")
-    with pytest.raises(ValueError, match=r"records.jsonl: cannot go on"):
+    with pytest.raises(ValueError, match=r"records.jsonl: cannot continue"):
         Records(path, header)
 
 
