@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseArray, PoseStamped
-from sensor_msgs.msg import CameraInfo, Image
+from geometry_msgs.msg import PoseStamped
 
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
+from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
     MessageError,
     camera_to_info,
@@ -46,14 +46,14 @@ class StubCameraNode(GraphNode):
         self._deaf_from = self.value("deaf_from")
         self._pose = ViewSphere().pose(ViewSphere().positions[self._seed % 100])
         self._count = 0
-        self._color = self.output(Image, "camera/color/image_raw", latched=True)
-        self._depth = self.output(Image, "camera/depth/image_raw", latched=True)
-        self._info = self.output(CameraInfo, "camera/color/camera_info", latched=True)
-        self._where = self.output(PoseStamped, "camera/pose", latched=True)
-        self._truth = self.output(PoseArray, "ground_truth/poses", latched=True)
-        self._start = self.output(DiagnosticArray, "episode/start", latched=True)
-        self._status = self.output(DiagnosticArray, "view_goal/status", latched=True)
-        self.input(PoseStamped, "view_goal", self._on_goal)
+        self._color = self.output(topics.CAMERA_COLOR)
+        self._depth = self.output(topics.CAMERA_DEPTH)
+        self._info = self.output(topics.CAMERA_INFO)
+        self._where = self.output(topics.CAMERA_POSE)
+        self._truth = self.output(topics.GROUND_TRUTH)
+        self._start = self.output(topics.EPISODE_START)
+        self._status = self.output(topics.GOAL_STATUS)
+        self.input(topics.VIEW_GOAL, self._on_goal)
 
     def begin(self) -> None:
         """Announce the episode and publish the first view."""

@@ -6,9 +6,10 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
 from stub_episode import StubEpisode
 
-from active6d_bringup.bags.writer import CONTRACT, EpisodeWriter
+from active6d_bringup.bags.writer import EpisodeWriter
 from active6d_bringup.nodes.bag_player import BagPlayerNode
 from active6d_core.ros.conversions import objects_to_cloud, stamp_to_ns
+from active6d_core.ros.topics import CONTRACT
 
 
 def test_objects_that_come_again_neither_skip_a_view_nor_end_the_player(graph, tmp_path):

@@ -8,7 +8,8 @@ from rclpy.serialization import serialize_message
 from stub_episode import StubEpisode
 
 from active6d_bringup.bags.reader import BagError, read_episode, read_episodes
-from active6d_bringup.bags.writer import CONTRACT, EpisodeWriter
+from active6d_bringup.bags.writer import EpisodeWriter
+from active6d_core.ros.topics import CONTRACT
 
 NAMES = {topic.name: topic.name if topic.name.startswith("/") else f"/{topic.name}" for topic in CONTRACT}
 

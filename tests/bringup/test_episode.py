@@ -10,15 +10,21 @@ from ros_harness import fresh_domain
 
 from active6d_bringup.bags.reader import read_episode
 from active6d_bringup.bags.replay import ReplaySettings, replay
-from active6d_bringup.bags.writer import CONTRACT, TYPESTORE, RecordingError
-from active6d_bringup.graph.composition import NODES, GraphDescription
+from active6d_bringup.bags.writer import TYPESTORE, RecordingError
+from active6d_bringup.graph.composition import GraphDescription
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, EpisodeSettings, describe, run_episode
 from active6d_core.ros.episode_messages import GoalStatus
+from active6d_core.ros.graph_nodes import NODES, NodeEntry
+from active6d_core.ros.topics import CONTRACT
 
 
 @pytest.fixture(autouse=True)
 def stub_camera(monkeypatch):
-    monkeypatch.setitem(NODES, "camera_simulator", ("stub_camera", "StubCameraNode"))
+    monkeypatch.setitem(
+        NODES,
+        "camera_simulator",
+        NodeEntry("stub_camera", "StubCameraNode"),
+    )
     import stub_camera  # noqa: F401  registers the estimator
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from active6d_agent.policies.registry import Observation, create_policy
 from active6d_bringup.bags.reader import read_episode
 from active6d_bringup.bags.replay import ReplaySettings, replay
-from active6d_bringup.bags.writer import CONTRACT, TYPESTORE, Per
+from active6d_bringup.bags.writer import TYPESTORE
 from active6d_bringup.graph.episode import EpisodeSettings, run_episode
 from active6d_core.object_model import load_object
 from active6d_core.ros.conversions import (
@@ -22,6 +22,7 @@ from active6d_core.ros.conversions import (
     objects_from_cloud,
     objects_to_cloud,
 )
+from active6d_core.ros.topics import CONTRACT, Per
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator

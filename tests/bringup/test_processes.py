@@ -13,9 +13,10 @@ from ros_harness import fresh_domain
 
 from active6d_bringup.bags.reader import read_episode
 from active6d_bringup.graph import processes as processes_module
-from active6d_bringup.graph.composition import NODES, GraphDescription, running
+from active6d_bringup.graph.composition import GraphDescription, running
 from active6d_bringup.graph.episode import EpisodeInterrupted, EpisodeSettings, run_episode
 from active6d_bringup.graph.processes import ProcessError, ProcessGraph
+from active6d_core.ros.graph_nodes import NODES, NodeEntry
 
 
 @pytest.fixture
@@ -29,8 +30,16 @@ def graphs(monkeypatch):
             started.append(self)
 
     monkeypatch.setattr(processes_module, "ProcessGraph", WatchedGraph)
-    monkeypatch.setitem(NODES, "camera_simulator", ("stub_camera", "StubCameraNode"))
-    monkeypatch.setitem(NODES, "pose_estimator", ("stub_estimator", "PoseEstimatorNode"))
+    monkeypatch.setitem(
+        NODES,
+        "camera_simulator",
+        NodeEntry("stub_camera", "StubCameraNode"),
+    )
+    monkeypatch.setitem(
+        NODES,
+        "pose_estimator",
+        NodeEntry("stub_estimator", "PoseEstimatorNode", restarted=True),
+    )
     yield started
     assert not [child for child in psutil.Process().children(recursive=True) if "--ros-args" in child.cmdline()]
 
@@ -103,7 +112,8 @@ def test_interrupt_closes_the_bag_and_ends_every_process(graphs, tmp_path):
 @pytest.mark.slow
 def test_nodes_die_with_a_killed_supervisor(graphs):
     script = (
-        "import sys, time; from active6d_bringup.graph.composition import NODES, GraphDescription;"
+        "import sys, time; from active6d_bringup.graph.composition import GraphDescription;"
+        "from active6d_core.ros.graph_nodes import NODES, NodeEntry;"
         "from active6d_bringup.graph.processes import ProcessGraph;"
         "graph = ProcessGraph(GraphDescription({'attention_policy': {}}, domain=77));"
         "graph.start(); print(*[process.pid for process in graph.processes.values()], flush=True); time.sleep(60)"

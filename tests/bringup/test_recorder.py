@@ -18,9 +18,10 @@ from rosbags.rosbag2 import Reader
 from std_srvs.srv import Trigger
 from stub_episode import StubEpisode, is_latched
 
-from active6d_bringup.bags.writer import CONTRACT, RecordingError, clear_padding, stamp_of
+from active6d_bringup.bags.writer import RecordingError, clear_padding, stamp_of
 from active6d_bringup.nodes.episode_recorder import EpisodeRecorderNode
 from active6d_core.ros.node import GraphNode
+from active6d_core.ros.topics import CONTRACT
 
 TYPES = {topic.name: topic.type for topic in CONTRACT}
 
@@ -89,7 +90,7 @@ def test_metadata_and_chunks(graph, tmp_path):
     for topic in CONTRACT:
         qos = offered[topic.name.lstrip("/")]
         assert qos.reliability == QosReliability.RELIABLE
-        assert (qos.durability == QosDurability.TRANSIENT_LOCAL) == topic.latched
+        assert (qos.durability == QosDurability.TRANSIENT_LOCAL) == topic.transient_local
     with next((tmp_path / "bag").glob("*.mcap")).open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert {index.compression for index in summary.chunk_indexes} == {"zstd"}

@@ -26,6 +26,10 @@ from active6d_core.ros.heartbeat import Awaited, Watch
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.parameters import describe_limits
 from active6d_core.ros.synchronizer import StampSynchronizer
+from active6d_core.ros.topics import Per, Topic
+
+RESULT = Topic("result", "std_msgs/msg/String", Per.VIEW, "depth_node")
+DEPTH = Topic("depth", "sensor_msgs/msg/Image", Per.VIEW, "camera")
 
 
 class DepthNode(GraphNode):
@@ -36,8 +40,8 @@ class DepthNode(GraphNode):
         self.declare("gain", 1.0, "factor", minimum=0.0, maximum=10.0)
         self.declare("mode", "mean", "what to publish", choices=("mean", "max"))
         self.declare("count", 1, "how many", minimum=1)
-        self.result = self.output(String, "result", latched=True)
-        self.input(Image, "depth", self.on_depth, latched=True)
+        self.result = self.output(RESULT)
+        self.input(DEPTH, self.on_depth)
         self.fail_at_setup = False
         self.wanted = None
 
@@ -389,7 +393,8 @@ class DriverNode(GraphNode):
     def __init__(self, **kwargs):
         super().__init__("driver_node", **kwargs)
         self.stamps = []
-        self.camera_input(Image, "camera/depth", lambda message: self.stamps.append(message.header.stamp.sec), False)
+        topic = Topic("camera/depth", "sensor_msgs/msg/Image", Per.VIEW, "camera")
+        self.input(topic, lambda message: self.stamps.append(message.header.stamp.sec), from_driver=True)
 
 
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])

@@ -4,7 +4,8 @@ import pytest
 from rclpy.context import Context
 from ros_harness import fresh_domain
 
-from active6d_bringup.graph.composition import NODES, load_node_type
+from active6d_bringup.graph.composition import load_node_type
+from active6d_core.ros.graph_nodes import NODES
 
 
 @pytest.fixture(params=NODES)

@@ -31,6 +31,11 @@ def test_stages_that_are_referred_to_exist():
     assert {service["build"]["target"] for service in SERVICES.values()} <= names
 
 
+def assignments(arguments: list[str]) -> list[tuple[str, str]]:
+    """Parameter and value of each ``-p name:=value``."""
+    return [tuple(value.split(":=", 1)) for flag, value in pairwise(arguments) if flag == "-p"]
+
+
 @pytest.mark.parametrize("name", SERVICES)
 def test_service(name):
     service = SERVICES[name]
@@ -42,6 +47,11 @@ def test_service(name):
     assert entry in (ROOT / "src" / package / "setup.py").read_text()
     given = {argument.split(":=")[0] for flag, argument in pairwise(rest) if flag == "-p"}
     assert given <= PARAMETERS[f"/**/{executable}"]["ros__parameters"].keys()
+    defaults = {name: re.search(r":-([^}]*)", value) for name, value in assignments(rest)}
+    for name, default in defaults.items():
+        if default is not None and name != "bag":
+            declared = PARAMETERS[f"/**/{executable}"]["ros__parameters"][name]
+            assert default[1] == str(declared), f"{name}: compose starts {default[1]}, the node {declared}"
     assert set(service.get("depends_on", [])) <= SERVICES.keys()
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from active6d_core.ros.graph_nodes import NODES
+
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "src/active6d_bringup/launch/active6d.launch.py"
 SYNTAX = ast.parse(LAUNCH.read_text())
@@ -26,17 +28,16 @@ def test_every_argument_has_a_description():
     descriptions = {name: entry.elts[2].value for name, entry in items("ARGUMENTS")}
     wanted = (
         "object policy seed scene steps metres estimator camera latched_camera record bag rviz namespace params_file"
-        " autostart use_sim_time"
+        " autostart use_sim_time play rate"
     )
     assert set(descriptions) == set(wanted.split())
     assert all(len(description) > 10 for description in descriptions.values())
 
 
 def test_nodes_take_what_the_launch_file_gives(node):
-    package, given = ast.literal_eval(table("NODES")).get(node.get_name(), (None, []))
-    if package is None:
-        pytest.skip("not launched")
-    assert type(node).__module__ == f"{package}.nodes.{node.get_name()}"
+    entry = NODES[node.get_name()]
+    given = entry.launch_parameters
+    assert (type(node).__module__, type(node).__name__) == (entry.module, entry.type_name)
     types = {name: value.id for name, value in items("TYPES")}
     for name in [*given, "autostart", "use_sim_time"]:
         assert type(node.get_parameter(name).value).__name__ == types.get(name, "str"), name
@@ -44,20 +45,17 @@ def test_nodes_take_what_the_launch_file_gives(node):
 
 def test_every_argument_reaches_every_node_that_has_it(node):
     """But for what is one node's own: the first view's seed is the camera's, the policy's budget the policy's."""
-    package, given = ast.literal_eval(table("NODES")).get(node.get_name(), (None, []))
-    if package is None:
-        pytest.skip("not launched")
+    given = NODES[node.get_name()].launch_parameters
     shared = {"object", "latched_camera", "metres", "steps"}
     assert {name for name in shared if node.has_parameter(name)} == shared & set(given)
 
 
 def test_every_executable_exists():
-    executables = ast.literal_eval(table("NODES"))
-    for executable, (package, _) in executables.items():
-        entry = f'"{executable} = {package}.nodes.{executable}:main"'
-        assert entry in (ROOT / "src" / package / "setup.py").read_text()
+    for executable, entry in NODES.items():
+        line = f'"{executable} = {entry.module}:main"'
+        assert line in (ROOT / "src" / entry.package / "setup.py").read_text()
     cameras = ast.literal_eval(table("CAMERAS"))
-    assert {name for names in cameras.values() for name in names} <= set(executables)
+    assert {name for names in cameras.values() for name in names} <= NODES.keys()
 
 
 def test_it_loads_where_launch_is_installed():

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from active6d_bringup.bags.writer import CONTRACT
+from active6d_core.ros.topics import CONTRACT
 
 BRINGUP = Path(__file__).parents[2] / "src/active6d_bringup"
 TYPES = {topic.name: topic.type for topic in CONTRACT}
-LATCHED = {topic.name for topic in CONTRACT if topic.latched}
+LATCHED = {topic.name for topic in CONTRACT if topic.transient_local}
 DISPLAYED = {
     "Image": "sensor_msgs/msg/Image",
     "Pose": "geometry_msgs/msg/PoseStamped",

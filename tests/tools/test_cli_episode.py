@@ -8,17 +8,21 @@ import pytest
 
 from active6d_bringup.bags.reader import read_episode
 from active6d_bringup.graph import episode as episode_module
-from active6d_bringup.graph.composition import NODES
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted
 from active6d_bringup.graph.processes import ProcessError
 from active6d_core.metrics import evaluate_scene
 from active6d_core.object_model import load_object
+from active6d_core.ros.graph_nodes import NODES, NodeEntry
 from active6d_tools.cli import app
 
 
 @pytest.fixture(autouse=True)
 def stub_camera(monkeypatch):
-    monkeypatch.setitem(NODES, "camera_simulator", ("stub_camera", "StubCameraNode"))
+    monkeypatch.setitem(
+        NODES,
+        "camera_simulator",
+        NodeEntry("stub_camera", "StubCameraNode"),
+    )
     import stub_camera  # noqa: F401  registers the estimator
 
 

@@ -6,9 +6,10 @@ import threading
 import pytest
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import Image
 from typer.testing import CliRunner
 
+from active6d_core.ros import topics
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_tools import graph_doctor
@@ -23,9 +24,9 @@ class Camera(GraphNode):
 
     def __init__(self, **arguments):
         super().__init__("camera", overrides=FAST, **arguments)
-        self.pose = self.output(PoseStamped, "camera/pose", latched=True)
-        self.color = self.output(Image, "camera/color/image_raw", latched=True)
-        self.input(PoseStamped, "view_goal", lambda message: None)
+        self.pose = self.output(topics.CAMERA_POSE)
+        self.color = self.output(topics.CAMERA_COLOR)
+        self.input(topics.VIEW_GOAL, lambda message: None)
 
     def begin(self):
         self.pose.publish(PoseStamped())
@@ -39,8 +40,8 @@ class Viewer(GraphNode):
 
     def __init__(self, **arguments):
         super().__init__("viewer", overrides=FAST, **arguments)
-        self.input(Image, "camera/color/image_raw", lambda message: None, latched=True)
-        self.input(CameraInfo, "camera/color/camera_info", lambda message: None, latched=True)
+        self.input(topics.CAMERA_COLOR, lambda message: None)
+        self.input(topics.CAMERA_INFO, lambda message: None)
 
     def awaited(self):
         return Awaited(("camera/color/image_raw",), 12_400_000_000)

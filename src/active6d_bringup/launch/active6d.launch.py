@@ -2,12 +2,15 @@
 
 from pathlib import Path
 
-from ament_index_python.packages import get_package_share_directory
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+
+from active6d_core.object_model import load_object
+from active6d_core.ros.graph_nodes import MAX_RESTARTS, NODES
 
 SHARE = Path(get_package_share_directory("active6d_bringup"))
 
@@ -15,68 +18,91 @@ SHARE = Path(get_package_share_directory("active6d_bringup"))
 ARGUMENTS = {
     "params_file": (str(SHARE / "config" / "active6d.yaml"), None, "parameters of all nodes"),
     "namespace": ("", None, "prefix of every node and topic"),
-    "camera": ("simulator", ["simulator", "dataset", "none"], "what feeds the camera topics; none for a real driver"),
+    "camera": (
+        "simulator",
+        ["simulator", "dataset", "bag", "none"],
+        "source of the camera topics; none: your driver",
+    ),
     "object": ("", None, "object that fills the bin; empty: as in params_file"),
-    "seed": ("", None, "of the heap, the sensor's noise and the policy; empty: as in params_file"),
-    "scene": ("", None, "stored scene such as mug/test/3 instead of a heap by seed; empty: as in params_file"),
+    "seed": ("", None, "seed of the pile, the sensor noise and the policy; empty: as in params_file"),
+    "scene": ("", None, "stored scene such as mug/test/3 instead of a simulated pile; empty: as in params_file"),
     "estimator": ("", None, "which pose estimator; empty: as in params_file"),
     "policy": ("", None, "which policy chooses the views; empty: as in params_file"),
     "steps": ("", None, "moves in an episode; empty: as in params_file"),
-    "metres": ("", None, "of travel in an episode, 0.0 for any; empty: as in params_file"),
+    "metres": ("", None, "travel budget of an episode in metres, 0.0: none; empty: as in params_file"),
     "latched_camera": ("", ["", "true", "false"], "false for a driver that keeps no views; empty: as in params_file"),
     "autostart": ("true", ["true", "false"], "nodes configure and activate themselves; false: `ros2 lifecycle set`"),
     "use_sim_time": ("false", ["true", "false"], "take the nodes' clock from /clock; stamps of views never do"),
+    "play": ("", None, "folder of the bag to play, with camera:=bag"),
+    "rate": ("", None, "speed of playing against the recording; 0.0: as fast as perception; empty: as in params_file"),
     "record": ("false", ["true", "false"], "record every topic of the graph"),
     "bag": ("", None, "folder of the recorded bag, with record:=true; empty: as in params_file"),
     "rviz": ("false", ["true", "false"], "show the graph in RViz"),
 }
 
-# executable: (package, arguments that it takes as parameters of the same name)
-NODES = {
-    "camera_simulator": ("active6d_sim", ["object", "seed", "scene"]),
-    "dataset_camera": ("active6d_sim", ["object", "scene"]),
-    "pose_estimator": ("active6d_perception", ["object", "estimator", "latched_camera"]),
-    "hypothesis_fusion": ("active6d_perception", ["object", "latched_camera"]),
-    "attention_policy": ("active6d_agent", ["object", "policy", "seed", "steps", "metres", "latched_camera"]),
-    "episode_recorder": ("active6d_bringup", ["bag", "latched_camera"]),
-}
-CAMERAS = {"simulator": ["camera_simulator"], "dataset": ["dataset_camera"], "none": []}
+CAMERAS = {"simulator": ["camera_simulator"], "dataset": ["dataset_camera"], "bag": ["bag_player"], "none": []}
 TYPES = {
     "seed": int,
     "steps": int,
     "metres": float,
+    "rate": float,
     "latched_camera": bool,
     "autostart": bool,
     "use_sim_time": bool,
 }
 
 
-def _node(executable: str, given: dict[str, str], **process_options) -> Node:
-    package, takes = NODES[executable]
+def _node(executable: str, given: dict[str, str]) -> Node:
+    entry = NODES[executable]
+    arguments = {"bag": "play"} if executable == "bag_player" else {}
     parameters = {
-        name: ParameterValue(LaunchConfiguration(name), value_type=TYPES.get(name, str))
-        for name in [*takes, "autostart", "use_sim_time"]
-        if given[name]
+        name: ParameterValue(LaunchConfiguration(arguments.get(name, name)), value_type=TYPES.get(name, str))
+        for name in [*entry.launch_parameters, "autostart", "use_sim_time"]
+        if given[arguments.get(name, name)]
     }
     return Node(
-        package=package,
+        package=entry.package,
         executable=executable,
         name=executable,
         namespace=given["namespace"],
         parameters=[given["params_file"], parameters],
         output="screen",
-        **process_options,
+        # A node that refuses its parameters (BAD_PARAMETERS) ends within a second; few retries bound that, too.
+        respawn=entry.restarted,
+        respawn_delay=1.0,
+        respawn_max_retries=MAX_RESTARTS,
     )
+
+
+def _refuse_what_cannot_work(given: dict[str, str]) -> None:
+    """Raise before any node starts.
+
+    Raises:
+        RuntimeError: an argument names something that is not there; the text says what to do.
+    """
+    if given["rviz"] == "true":
+        try:
+            get_package_share_directory("rviz2")
+        except PackageNotFoundError as error:
+            raise RuntimeError("rviz:=true needs rviz2: apt install ros-jazzy-rviz2, or rviz:=false") from error
+    if given["object"]:
+        try:
+            load_object(given["object"])
+        except ValueError as error:
+            raise RuntimeError(f"object:={given['object']}: {error}") from error
+    if given["camera"] == "bag" and not given["play"]:
+        raise RuntimeError("camera:=bag needs play:=FOLDER, the folder of a recorded bag")
+    if not Path(given["params_file"]).is_file():
+        raise RuntimeError(f"params_file:={given['params_file']} does not exist")
 
 
 def _graph(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    # Who listens starts first. The estimator is the node that a driver or a network can bring down: it comes back, and
-    # takes the last view again from the latched camera topics.
-    nodes = [_node("episode_recorder", given)] if given["record"] == "true" else []
-    nodes.append(_node("pose_estimator", given, respawn=True, respawn_delay=1.0, respawn_max_retries=3))
-    nodes += [_node(executable, given) for executable in ("hypothesis_fusion", "attention_policy")]
-    nodes += [_node(executable, given) for executable in CAMERAS[given["camera"]]]
+    _refuse_what_cannot_work(given)
+    wanted = {"pose_estimator", "hypothesis_fusion", "attention_policy", *CAMERAS[given["camera"]]}
+    if given["record"] == "true":
+        wanted.add("episode_recorder")
+    nodes = [_node(executable, given) for executable in NODES if executable in wanted]
     if given["rviz"] == "true":
         layout = str(SHARE / "rviz" / "active6d.rviz")
         nodes.append(Node(package="rviz2", executable="rviz2", namespace=given["namespace"], arguments=["-d", layout]))

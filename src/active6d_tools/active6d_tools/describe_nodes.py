@@ -12,7 +12,8 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy
 
-from active6d_bringup.graph.composition import NODES, load_node_type
+from active6d_bringup.graph.composition import load_node_type
+from active6d_core.ros.graph_nodes import NODES
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.parameters import describe_limits
 

@@ -14,8 +14,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
-from active6d_bringup.bags.writer import CONTRACT
 from active6d_core.ros.conversions import HARDWARE_ID
+from active6d_core.ros.topics import CONTRACT
 from active6d_tools.doctor import Check
 
 _NAME = "active6d_doctor"
@@ -63,7 +63,7 @@ class _Listener(Node):
         self.topics = {topic.name: self.resolve_topic_name(topic.name) for topic in CONTRACT}
         self.received: dict[str, int] = defaultdict(int)
         self.heartbeats: dict[str, DiagnosticStatus] = {}
-        self.latched = {topic.name for topic in CONTRACT if topic.latched}
+        self.latched = {topic.name for topic in CONTRACT if topic.transient_local}
         self._subscribed = {_DIAGNOSTICS}
         self.create_subscription(DiagnosticArray, _DIAGNOSTICS, self._on_diagnostics, 100)
 

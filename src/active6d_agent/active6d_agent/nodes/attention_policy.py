@@ -13,6 +13,7 @@ from active6d_agent.policies.registry import Decision, choose_policy, create_pol
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
+from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
     OutdatedError,
     attention_to_cloud,
@@ -63,14 +64,14 @@ class AttentionPolicyNode(GraphNode):
             minimum=0.0,
         )
         self._declare_views()
-        self.attention = self.output(PointCloud2, "attention")
-        self.goal = self.output(PoseStamped, "view_goal")
-        self.end = self.output(DiagnosticArray, "episode/end", latched=True)
-        self.input(PointCloud2, "objects", self._on_objects, latched=True)
-        self.input(PointCloud2, "objects/unexplained", self._on_unexplained, latched=True)
+        self.attention = self.output(topics.ATTENTION)
+        self.goal = self.output(topics.VIEW_GOAL)
+        self.end = self.output(topics.EPISODE_END)
+        self.input(topics.OBJECTS, self._on_objects)
+        self.input(topics.UNEXPLAINED, self._on_unexplained)
         self._views = ViewInputs(self, ["pose"], self._on_view, _OTHERS)
-        self.input(DiagnosticArray, "episode/start", self._on_start, latched=True)
-        self.input(DiagnosticArray, "view_goal/status", self._on_status, latched=True)
+        self.input(topics.EPISODE_START, self._on_start)
+        self.input(topics.GOAL_STATUS, self._on_status)
         self._timer = None
         self._forget()
 

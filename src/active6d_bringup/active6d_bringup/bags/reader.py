@@ -12,7 +12,7 @@ import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
 
-from active6d_bringup.bags.writer import CAMERA_TOPICS, CONTRACT, END, POSE, START, TYPESTORE
+from active6d_bringup.bags.writer import TYPESTORE
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.ros.conversions import (
@@ -30,6 +30,9 @@ from active6d_core.ros.conversions import (
     poses_from_array,
     stamp_to_ns,
 )
+from active6d_core.ros.topics import CAMERA_POSE, CAMERA_TOPICS, CONTRACT, EPISODE_END, EPISODE_START, GROUND_TRUTH
+
+_POSE_ENDING = f"/{CAMERA_POSE.name}"
 
 
 class BagError(ValueError):
@@ -160,11 +163,11 @@ def topic_names(connections: list[Connection], folder: Path) -> dict[str, str]:
     Raises:
         BagError: the bag has no camera pose, or several (more than one namespace).
     """
-    poses = sorted({connection.topic for connection in connections if connection.topic.endswith(f"/{POSE}")})
+    poses = sorted({connection.topic for connection in connections if connection.topic.endswith(_POSE_ENDING)})
     if len(poses) != 1:
-        found = f"several namespaces ({', '.join(poses)})" if poses else f"no topic {POSE}"
+        found = f"several namespaces ({', '.join(poses)})" if poses else f"no topic {CAMERA_POSE.name}"
         raise BagError(f"{folder}: has {found}; it is not an episode of active6d")
-    prefix = poses[0].removesuffix(POSE)
+    prefix = poses[0].removesuffix(CAMERA_POSE.name)
     known = {topic.name if topic.name.startswith("/") else prefix + topic.name: topic for topic in CONTRACT}
     wrong = [
         connection
@@ -204,7 +207,7 @@ def _episodes(folder: Path, messages: dict[str, dict[int, Any]], latencies: dict
     views = sorted(set.intersection(*(set(messages[topic.name]) for topic in CAMERA_TOPICS)))
     if not views:
         raise BagError(f"{folder}: holds no complete view (color, depth, camera_info and pose of one stamp)")
-    starts = [views[0], *(start for start in sorted(messages[START]) if views[0] < start <= views[-1])]
+    starts = [views[0], *(start for start in sorted(messages[EPISODE_START.name]) if views[0] < start <= views[-1])]
     limits = [*starts[1:], views[-1] + 1]
     return [_episode(folder, messages, latencies, *span, views) for span in zip(starts, limits, strict=True)]
 
@@ -215,10 +218,10 @@ def _episode(folder: Path, messages: dict, latencies: dict, start: int, limit: i
     def within(topic: str) -> list[Any]:
         return [message for stamp, message in sorted(messages[topic].items()) if start <= stamp < limit]
 
-    world = messages[POSE][start].header.frame_id
-    truth, ends = within("ground_truth/poses"), within(END)
+    world = messages[CAMERA_POSE.name][start].header.frame_id
+    truth, ends = within(GROUND_TRUTH.name), within(EPISODE_END.name)
     # The camera's word comes last: both sides say their seed, and the camera's is the one of the heap.
-    statuses = [status for message in (*ends, *within(START)) for status in message.status]
+    statuses = [status for message in (*ends, *within(EPISODE_START.name)) for status in message.status]
     return EpisodeRecord(
         folder=folder,
         info={pair.key: pair.value for status in statuses for pair in status.values},
@@ -237,7 +240,7 @@ def _step(messages: dict[str, dict[int, Any]], latency_ms: dict[str, float], sta
         color=image_to_color(at["camera/color/image_raw"]),
         depth=image_to_depth(depth),
         camera=info_to_camera(at["camera/color/camera_info"]),
-        T_world_camera=pose_stamped_to_transform(at[POSE], world),
+        T_world_camera=pose_stamped_to_transform(at[CAMERA_POSE.name], world),
     )
     hypotheses = objects = unexplained = attention = attended = goal = None
     if "hypotheses" in at and "hypotheses/segmentation" in at:

@@ -12,21 +12,16 @@ import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Image, PointCloud2
 
 from active6d_bringup.bags.reader import BagError, open_bag, read_episodes, topic_names
 from active6d_bringup.bags.writer import SETTINGS, TYPESTORE, stamp_of
 from active6d_bringup.graph.composition import GraphDescription, OnEvent, default_params_file, running
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
+from active6d_core.ros.conversions import read_table
+from active6d_core.ros.topics import PERCEPTION_TOPICS, Topic
 
-#: What perception makes of a view, in the order in which it is made.
-COMPARED = {
-    "hypotheses": "sensor_msgs/msg/PointCloud2",
-    "hypotheses/segmentation": "sensor_msgs/msg/Image",
-    "objects": "sensor_msgs/msg/PointCloud2",
-    "objects/unexplained": "sensor_msgs/msg/PointCloud2",
-}
-_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+#: What perception makes of a view, by topic name.
+COMPARED = {topic.name: topic for topic in PERCEPTION_TOPICS}
 
 
 @dataclass(frozen=True)
@@ -178,7 +173,7 @@ def describe(settings: ReplaySettings, recorded_object: str | None) -> GraphDesc
 
 def compare(stamp: int, topic: str, recorded: bytes | None, live: bytes) -> Comparison:
     """Compare the serialized messages of one view and topic."""
-    message_type = COMPARED[topic]
+    message_type = COMPARED[topic].type
     found = TYPESTORE.deserialize_cdr(live, message_type)
     size = found.width * found.height
     if recorded is None:
@@ -195,23 +190,13 @@ def _differences(expected: Any, found: Any) -> dict[str, float]:
     if hasattr(expected, "encoding"):
         wrong = (expected.data != found.data).reshape(expected.height * expected.width, -1).any(axis=1)
         return {"pixels": float(wrong.mean())}
-    tables = [_table(message) for message in (expected, found)]
+    tables = [read_table(message) for message in (expected, found)]
     if tables[0].dtype != tables[1].dtype:
         return {"columns": float("nan")}
     largest = {
         name: np.abs(tables[0][name].astype(float) - tables[1][name]).max(initial=0.0) for name in tables[0].dtype.names
     }
     return {name: float(difference) for name, difference in largest.items() if difference != 0}
-
-
-def _table(message: Any) -> np.ndarray:
-    layout = {
-        "names": [column.name for column in message.fields],
-        "formats": [f"<{_DTYPES[column.datatype]}" for column in message.fields],
-        "offsets": [column.offset for column in message.fields],
-        "itemsize": message.point_step,
-    }
-    return np.frombuffer(message.data.tobytes(), np.dtype(layout))
 
 
 def _read_settings(folder: Path) -> dict[str, dict[str, Any]]:
@@ -245,13 +230,12 @@ class _Listener(Node):
         super().__init__("replay_listener", context=context, start_parameter_services=False, enable_rosout=False)
         self.payloads: dict[tuple[str, int], bytes] = {}
         qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        for topic, message_type in COMPARED.items():
+        for topic in PERCEPTION_TOPICS:
 
-            def keep(payload: bytes, topic: str = topic, message_type: str = message_type) -> None:
-                self.payloads[topic, stamp_of(message_type, payload)] = payload
+            def keep(payload: bytes, topic: Topic = topic) -> None:
+                self.payloads[topic.name, stamp_of(topic.type, payload)] = payload
 
-            kind = Image if message_type.endswith("Image") else PointCloud2
-            self.create_subscription(kind, topic, keep, qos, raw=True)
+            self.create_subscription(topic.message_type, topic.name, keep, qos, raw=True)
 
     def answered(self, stamps: list[int]) -> list[int]:
         """The views for which everything that is compared has arrived."""

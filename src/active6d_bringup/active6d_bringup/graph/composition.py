@@ -13,16 +13,7 @@ from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
-#: Node name to its module and class. Their order is the order of starting: who listens comes before who speaks.
-NODES = {
-    "episode_recorder": ("active6d_bringup.nodes.episode_recorder", "EpisodeRecorderNode"),
-    "attention_policy": ("active6d_agent.nodes.attention_policy", "AttentionPolicyNode"),
-    "hypothesis_fusion": ("active6d_perception.nodes.hypothesis_fusion", "HypothesisFusionNode"),
-    "pose_estimator": ("active6d_perception.nodes.pose_estimator", "PoseEstimatorNode"),
-    "bag_player": ("active6d_bringup.nodes.bag_player", "BagPlayerNode"),
-    "dataset_camera": ("active6d_sim.nodes.dataset_camera", "DatasetCameraNode"),
-    "camera_simulator": ("active6d_sim.nodes.camera_simulator", "CameraSimulatorNode"),
-}
+from active6d_core.ros.graph_nodes import NODES
 
 OnEvent = Callable[[str], None]
 
@@ -147,8 +138,8 @@ class ComposedGraph:
 
 def load_node_type(name: str) -> type[Node]:
     """The class of a node in ``NODES``."""
-    module, node_type = NODES[name]
-    return getattr(import_module(module), node_type)
+    entry = NODES[name]
+    return getattr(import_module(entry.module), entry.type_name)
 
 
 def open_context(description: GraphDescription) -> Context:

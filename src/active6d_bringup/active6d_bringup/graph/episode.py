@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from active6d_bringup.bags.writer import RecordingError, describe_missing
+from active6d_bringup.bags.writer import RecordingError
 from active6d_bringup.graph.composition import (
     ComposedGraph,
     Graph,
@@ -28,6 +28,7 @@ from active6d_bringup.graph.composition import (
     running,
 )
 from active6d_core.hypotheses import SceneObjects
+from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
     latencies_from_diagnostics,
     objects_from_cloud,
@@ -255,10 +256,12 @@ def _spin_to_end(
         idle = time.monotonic() - since
         if not awaited and graph.restarted and idle > _SETTLE_SECONDS:
             # Whoever is killed while it speaks is not heard by all: the episode went on, the recorder missed a word.
-            note(f"the bag is not complete: no answer from {describe_missing(unrecorded)}")
+            note(f"the bag is not complete: no answer from {topics.describe_missing(unrecorded)}")
             return
         if idle > patience:
-            silent = f"no progress for {patience:.0f} s: no answer from {describe_missing(awaited or unrecorded)}"
+            silent = (
+                f"no progress for {patience:.0f} s: no answer from {topics.describe_missing(awaited or unrecorded)}"
+            )
             raise EpisodeError("; ".join([silent, *monitor.last_refusal]))
         graph.spin_once(0.1)
 
@@ -285,14 +288,14 @@ class EpisodeMonitor(Node):
         self._info: dict[str, str] = {}
         self._reason = ""
         self._began = self._ended = 0.0
-        self._listen(PoseStamped, "camera/pose", self._on_pose, latched=True)
-        self._listen(PointCloud2, "hypotheses", self._on_hypotheses)
-        self._listen(PointCloud2, "objects", self._on_objects)
-        self._listen(PoseStamped, "view_goal", self._on_goal)
-        self._listen(PoseArray, "ground_truth/poses", self._on_ground_truth, latched=True)
-        self._listen(DiagnosticArray, "episode/start", self._on_start, latched=True)
-        self._listen(DiagnosticArray, "episode/end", self._on_end, latched=True)
-        self._listen(DiagnosticArray, "/diagnostics", self._on_diagnostics)
+        self._listen(topics.CAMERA_POSE, self._on_pose)
+        self._listen(topics.HYPOTHESES, self._on_hypotheses)
+        self._listen(topics.OBJECTS, self._on_objects)
+        self._listen(topics.VIEW_GOAL, self._on_goal)
+        self._listen(topics.GROUND_TRUTH, self._on_ground_truth)
+        self._listen(topics.EPISODE_START, self._on_start)
+        self._listen(topics.EPISODE_END, self._on_end)
+        self._listen(topics.DIAGNOSTICS, self._on_diagnostics)
 
     @property
     def last(self) -> int:
@@ -306,10 +309,10 @@ class EpisodeMonitor(Node):
             return []
         # A goal whose view does not come was refused or is under way: either way it is the camera's turn.
         if not view or view in self._goals:
-            return ["camera/pose"]
+            return [topics.CAMERA_POSE.name]
         if view not in self._hypotheses:
-            return ["hypotheses"]
-        return ["view_goal"] if view in self._objects else ["objects"]
+            return [topics.HYPOTHESES.name]
+        return [(topics.VIEW_GOAL if view in self._objects else topics.OBJECTS).name]
 
     def result(self, settings: EpisodeSettings, events: list[str]) -> EpisodeResult:
         """What has been heard of the episode, which must have ended."""
@@ -325,16 +328,16 @@ class EpisodeMonitor(Node):
             events=events,
         )
 
-    def _listen(self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool = False) -> None:
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    def _listen(self, topic: topics.Topic, callback: Callable[[Any], None]) -> None:
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.transient_local else DurabilityPolicy.VOLATILE
         qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
         def heard(message: Any) -> None:
             callback(message)
-            self.received += topic != "/diagnostics"
+            self.received += topic is not topics.DIAGNOSTICS
             self._report_steps()
 
-        self.create_subscription(message_type, topic, heard, qos)
+        self.create_subscription(topic.message_type, topic.name, heard, qos)
 
     def _report_steps(self) -> None:
         for index, stamp in enumerate(sorted(self._poses.keys() & self._objects)):

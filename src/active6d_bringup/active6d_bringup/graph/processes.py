@@ -17,12 +17,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from active6d_bringup.graph.composition import NODES, GraphDescription, OnEvent, open_context
+from active6d_bringup.graph.composition import GraphDescription, OnEvent, open_context
+from active6d_core.ros.graph_nodes import BAD_PARAMETERS, MAX_RESTARTS, NODES
 from active6d_core.ros.node import connections
 
-#: Nodes that an episode survives: they find their inputs again as latched messages.
-RESTARTED = ("hypothesis_fusion", "pose_estimator")
-_RESTARTS = 5
 _STOP_SECONDS = 15.0
 
 
@@ -121,7 +119,7 @@ class ProcessGraph:
     def _spawn(self, name: str, autostart: bool) -> None:
         description = self._description
         parameters = {**description.nodes[name], "autostart": autostart}
-        command = [sys.executable, "-m", NODES[name][0], *description.ros_arguments()]
+        command = [sys.executable, "-m", NODES[name].module, *description.ros_arguments()]
         if description.namespace:
             command += ["-r", f"__ns:=/{description.namespace.strip('/')}"]
         for key, value in parameters.items():
@@ -135,10 +133,10 @@ class ProcessGraph:
     def _bury(self, name: str, code: int) -> None:
         cause = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         del self.processes[name]
-        if not self._started or code == 2 or name not in RESTARTED:
+        if not self._started or code == BAD_PARAMETERS or not NODES[name].restarted:
             raise ProcessError(f"{name} ended ({cause}); see its own message above")
-        if self.restarted.count(name) == _RESTARTS:
-            raise ProcessError(f"{name} ended ({cause}) for the {_RESTARTS + 1}th time; giving up")
+        if self.restarted.count(name) == MAX_RESTARTS:
+            raise ProcessError(f"{name} ended ({cause}) for the {MAX_RESTARTS + 1}th time; giving up")
         self.restarted.append(name)
         self._on_event(f"{name} died ({cause}), starting it again")
         self._spawn(name, autostart=True)

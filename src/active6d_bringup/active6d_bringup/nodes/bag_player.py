@@ -1,23 +1,20 @@
 """Node ``bag_player``: publishes the camera's messages of a recorded episode again."""
 
 from collections import defaultdict
-from importlib import import_module
 from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
 from active6d_bringup.bags.reader import BagError, open_bag, topic_names
-from active6d_bringup.bags.writer import CAMERA_TOPICS, CONTRACT, END, stamp_of
+from active6d_bringup.bags.writer import stamp_of
+from active6d_core.ros import topics
 from active6d_core.ros.clock_output import ClockOutput
 from active6d_core.ros.conversions import stamp_to_ns
 from active6d_core.ros.episode_messages import EpisodeEnd
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
-
-_REPLAYED = (*CAMERA_TOPICS, *(topic for topic in CONTRACT if topic.name in ("episode/start", "ground_truth/poses")))
 
 
 class BagPlayerNode(GraphNode):
@@ -38,12 +35,10 @@ class BagPlayerNode(GraphNode):
         )
         self._clock_output = ClockOutput(self)
         self._outputs = {}
-        for topic in _REPLAYED:
-            package, _, name = topic.type.split("/")
-            message_type = getattr(import_module(f"{package}.msg"), name)
-            self._outputs[topic.name] = self.output(message_type, topic.name, latched=True)
-        self._end = self.output(DiagnosticArray, END, latched=True)
-        self.input(PointCloud2, "objects", self._on_objects, latched=True)
+        for topic in topics.REPLAYED_TOPICS:
+            self._outputs[topic.name] = self.output(topic)
+        self._end = self.output(topics.EPISODE_END)
+        self.input(topics.OBJECTS, self._on_objects)
         self._timer: Timer | None = None
 
     def setup(self) -> None:
@@ -103,7 +98,7 @@ class BagPlayerNode(GraphNode):
 
 def _read_views(folder: Path) -> tuple[dict[int, dict[str, bytes]], dict[int, int]]:
     """Per complete view's stamp: its serialized messages by topic, and when (ns) its pose was recorded."""
-    types = {topic.name: topic.type for topic in _REPLAYED}
+    types = {topic.name: topic.type for topic in topics.REPLAYED_TOPICS}
     views: dict[int, dict[str, bytes]] = defaultdict(dict)
     received: dict[int, int] = {}
     with open_bag(folder) as reader:
@@ -116,7 +111,9 @@ def _read_views(folder: Path) -> tuple[dict[int, dict[str, bytes]], dict[int, in
             if topic == "camera/pose":
                 received[stamp] = timestamp
     complete = {
-        stamp: messages for stamp, messages in views.items() if all(topic.name in messages for topic in CAMERA_TOPICS)
+        stamp: messages
+        for stamp, messages in views.items()
+        if all(topic.name in messages for topic in topics.CAMERA_TOPICS)
     }
     if not complete:
         raise BagError(f"{folder}: holds no complete view (color, depth, camera_info and pose of one stamp)")

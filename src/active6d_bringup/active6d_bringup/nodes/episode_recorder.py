@@ -2,16 +2,16 @@
 
 import signal
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from active6d_bringup.bags.writer import CONTRACT, END, EpisodeWriter, RecordedTopic, describe_missing
+from active6d_bringup.bags.writer import EpisodeWriter
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
+from active6d_core.ros.topics import CONTRACT, EPISODE_END, Topic, describe_missing
 
 
 class EpisodeRecorderNode(GraphNode):
@@ -70,17 +70,15 @@ class EpisodeRecorderNode(GraphNode):
         """Topics that the recording of an episode ending at the view with this stamp (ns) still waits for."""
         return self._writer.missing(stamp)
 
-    def _subscribe(self, topic: RecordedTopic) -> Subscription:
-        from_driver = topic.name.startswith("camera/") and not self.value("latched_camera")
-        latched = topic.latched and not from_driver
+    def _subscribe(self, topic: Topic) -> Subscription:
+        from_driver = topic.from_camera and not self.value("latched_camera")
+        latched = topic.transient_local and not from_driver
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_ALL,
             reliability=ReliabilityPolicy.BEST_EFFORT if from_driver else ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        package, _, name = topic.type.split("/")
-        message_type = getattr(import_module(f"{package}.msg"), name)
-        return self.create_subscription(message_type, topic.name, partial(self._write, topic.name), qos, raw=True)
+        return self.create_subscription(topic.message_type, topic.name, partial(self._write, topic.name), qos, raw=True)
 
     def _write(self, topic: str, payload: bytes) -> None:
         if self._writer is not None:
@@ -92,7 +90,7 @@ class EpisodeRecorderNode(GraphNode):
             response.message = "not recording"
             return response
         end = self._writer.last_end
-        missing = [END] if end is None else self._writer.missing(end)
+        missing = [EPISODE_END.name] if end is None else self._writer.missing(end)
         response.success = not missing
         state = f"no answer from {describe_missing(missing)}" if missing else "complete"
         response.message = f"{self._writer.message_count} messages, {state}"

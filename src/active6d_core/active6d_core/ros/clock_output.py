@@ -4,6 +4,7 @@ from rosgraph_msgs.msg import Clock
 
 from active6d_core.ros.conversions import ns_to_stamp
 from active6d_core.ros.node import GraphNode
+from active6d_core.ros.topics import CLOCK
 
 _PERIOD_SECONDS = 0.1
 
@@ -18,7 +19,7 @@ class ClockOutput:
     def __init__(self, node: GraphNode) -> None:
         node.declare("publish_clock", False, "publish the stamps of views on /clock, for use_sim_time", fixed=True)
         self._stamp: int | None = None
-        self._publisher = node.output(Clock, "/clock") if node.value("publish_clock") else None
+        self._publisher = node.output(CLOCK) if node.value("publish_clock") else None
         if self._publisher is not None:
             node.wall_timer(_PERIOD_SECONDS, self._publish)
 

@@ -8,6 +8,7 @@ message objects that rosbags deserialises.
 import array
 import re
 from copy import copy
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -36,7 +37,17 @@ OBJECT_COLUMNS = {
 POINT_COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4"}
 ATTENTION_COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4", "weight": "<f4", "attended": "|u1"}
 
-_DATATYPES = {"<f4": PointField.FLOAT32, "<u2": PointField.UINT16, "|u1": PointField.UINT8}
+_DTYPES = {
+    PointField.INT8: "|i1",
+    PointField.UINT8: "|u1",
+    PointField.INT16: "<i2",
+    PointField.UINT16: "<u2",
+    PointField.INT32: "<i4",
+    PointField.UINT32: "<u4",
+    PointField.FLOAT32: "<f4",
+    PointField.FLOAT64: "<f8",
+}
+_DATATYPES = {dtype: datatype for datatype, dtype in _DTYPES.items()}
 _COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
 #: A quaternion whose norm is further from one than this was not meant as a rotation.
 _QUATERNION_TOLERANCE = 1e-2
@@ -387,18 +398,32 @@ def _cloud_to_table(message: PointCloud2, columns: dict[str, str], frame: str, m
         raise MessageError(
             f"table of {rows} rows has steps {message.point_step}, {message.row_step} and {len(message.data)} bytes"
         )
-    offsets = {field.name: (field.offset, field.datatype, field.count) for field in message.fields}
+    table = read_table(message)
     for name, dtype in columns.items():
-        offset, datatype, count = offsets.get(name, (0, None, 0))
-        if datatype != _DATATYPES[dtype] or count != 1 or offset + np.dtype(dtype).itemsize > message.point_step:
+        if name not in table.dtype.names or table.dtype[name].str != dtype:
             raise MessageError(f"table has no usable column '{name}' of type {dtype}")
+    return table
+
+
+def read_table(message: Any) -> np.ndarray:
+    """A PointCloud2's points as a structured array with its single-valued columns, whichever library made it.
+
+    Columns of unknown types, with several values per point, or beyond the point's size are left out.
+    """
+    usable = [
+        field
+        for field in message.fields
+        if field.datatype in _DTYPES
+        and field.count == 1
+        and field.offset + np.dtype(_DTYPES[field.datatype]).itemsize <= message.point_step
+    ]
     layout = {
-        "names": list(columns),
-        "formats": list(columns.values()),
-        "offsets": [offsets[name][0] for name in columns],
+        "names": [field.name for field in usable],
+        "formats": [_DTYPES[field.datatype] for field in usable],
+        "offsets": [field.offset for field in usable],
     }
-    if rows == 0:
-        return np.zeros(0, _layout(columns))
+    if message.width * message.height == 0:
+        return np.zeros(0, np.dtype(layout))
     return np.frombuffer(message.data, np.dtype({**layout, "itemsize": message.point_step}))
 
 

@@ -24,6 +24,7 @@ from std_srvs.srv import Trigger
 from active6d_core.ros.conversions import HARDWARE_ID, MessageError, OutdatedError, ns_to_stamp
 from active6d_core.ros.heartbeat import Awaited, Watch
 from active6d_core.ros.parameters import ParameterNode
+from active6d_core.ros.topics import Topic
 
 # Both ends: a reliable writer forgets what its queue cannot hold, received by everybody or not.
 _QUEUE_DEPTH = 10
@@ -95,26 +96,21 @@ class GraphNode(ParameterNode):
         """A timer on a clock that no simulation sets; it is for watching, results must not depend on it."""
         return self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def output(self, message_type: type, topic: str, latched: bool = False) -> Publisher:
-        """A reliable publisher; ``latched`` makes it transient local, so that late-joining subscribers get messages."""
+    def output(self, topic: Topic) -> Publisher:
+        """A reliable publisher of a topic, with the durability that the topic declares."""
         return self.create_lifecycle_publisher(
-            message_type, topic, _qos(latched, depth=_QUEUE_DEPTH), qos_overriding_options=_overridable()
+            topic.message_type, topic.name, _qos(topic), qos_overriding_options=_overridable()
         )
 
-    def input(
-        self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool = False
-    ) -> Subscription:
-        """A reliable subscription; a message for which the callback raises :class:`MessageError` is refused."""
-        return self._subscribe(message_type, topic, callback, _qos(latched, depth=_QUEUE_DEPTH))
+    def input(self, topic: Topic, callback: Callable[[Any], None], from_driver: bool = False) -> Subscription:
+        """A subscription of a topic; a message for which the callback raises :class:`MessageError` is refused.
 
-    def camera_input(
-        self, message_type: type, topic: str, callback: Callable[[Any], None], latched: bool
-    ) -> Subscription:
-        """An :meth:`input` from a camera: transient local as this project's, else best effort as suits all drivers."""
-        qos = _qos(latched, depth=_QUEUE_DEPTH)
-        if not latched:
-            qos.reliability = ReliabilityPolicy.BEST_EFFORT
-        return self._subscribe(message_type, topic, callback, qos)
+        ``from_driver`` takes messages as sensor data (best effort, volatile), which matches every camera driver.
+        """
+        qos = _qos(topic)
+        if from_driver:
+            qos.reliability, qos.durability = ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE
+        return self._subscribe(topic.message_type, topic.name, callback, qos)
 
     def _subscribe(
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
@@ -313,9 +309,9 @@ def connections(node: Node) -> dict[str, list[tuple[str, int]]]:
     }
 
 
-def _qos(latched: bool, depth: int) -> QoSProfile:
-    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+def _qos(topic: Topic) -> QoSProfile:
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.transient_local else DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=topic.depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
 
 def _overridable() -> QoSOverridingOptions:

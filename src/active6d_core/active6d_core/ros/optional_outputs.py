@@ -13,6 +13,7 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel
 from active6d_core.ros.conversions import make_header, transform_to_pose
 from active6d_core.ros.node import GraphNode
+from active6d_core.ros.topics import DETECTIONS, TRANSFORMS
 
 
 def import_optional(package: str) -> ModuleType | None:
@@ -28,7 +29,7 @@ class TransformOutput:
 
     def __init__(self, node: GraphNode) -> None:
         self._messages = import_optional("tf2_msgs")
-        self._publisher = node.output(self._messages.TFMessage, "/tf") if self._messages else None
+        self._publisher = node.output(TRANSFORMS) if self._messages else None
 
     def publish(self, T_parent_children: dict[str, np.ndarray], stamp: int, parent: str) -> None:
         """Send (4, 4) poses of child frames, by name, in the frame ``parent``."""
@@ -41,7 +42,7 @@ class DetectionOutput:
 
     def __init__(self, node: GraphNode, topic: str) -> None:
         self._messages = import_optional("vision_msgs")
-        self._publisher = node.output(self._messages.Detection3DArray, topic, latched=True) if self._messages else None
+        self._publisher = node.output(DETECTIONS) if self._messages else None
 
     def publish(self, objects: SceneObjects, model: ObjectModel, stamp: int, frame: str) -> None:
         """Send objects whose poses are in ``frame``; the score of a detection is its verification score."""

@@ -5,8 +5,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
-from sensor_msgs.msg import CameraInfo, Image
 
 from active6d_core.ros.conversions import (
     MessageError,
@@ -20,14 +18,15 @@ from active6d_core.ros.conversions import (
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.synchronizer import StampSynchronizer
+from active6d_core.ros.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_INFO, CAMERA_POSE, TRANSFORMS, Topic
 from active6d_core.ros.transform_input import TransformInput
 
-# part of a view: (message type, topic, reader)
-_CAMERA = {
-    "color": (Image, "camera/color/image_raw", image_to_color),
-    "depth": (Image, "camera/depth/image_raw", image_to_depth),
-    "camera": (CameraInfo, "camera/color/camera_info", info_to_camera),
-    "pose": (PoseStamped, "camera/pose", lambda message: pose_to_transform(message.pose)),
+# part of a view: (topic, reader)
+_CAMERA: dict[str, tuple[Topic, Callable[[Any], Any]]] = {
+    "color": (CAMERA_COLOR, image_to_color),
+    "depth": (CAMERA_DEPTH, image_to_depth),
+    "camera": (CAMERA_INFO, info_to_camera),
+    "pose": (CAMERA_POSE, lambda message: pose_to_transform(message.pose)),
 }
 _IMAGES = ("color", "depth", "segmentation")
 
@@ -50,7 +49,7 @@ class ViewInputs:
         others: Mapping[str, str] | None = None,
     ) -> None:
         self._node, self._callback = node, callback
-        self._topics = {**{part: _CAMERA[part][1] for part in parts}, **(others or {})}
+        self._topics = {**{part: _CAMERA[part][0].name for part in parts}, **(others or {})}
         node.declare(
             "latched_camera", True, "camera topics are transient local; false for plain camera drivers", fixed=True
         )
@@ -64,11 +63,11 @@ class ViewInputs:
         self._transforms: TransformInput | None = None
         if "pose" in parts and node.value("pose_source") == "tf":
             self._transforms = TransformInput(node)
-            self._topics["pose"] = "/tf"
+            self._topics["pose"] = TRANSFORMS.name
         for part in parts:
             if part != "pose" or self._transforms is None:
-                message_type, topic, _ = _CAMERA[part]
-                node.camera_input(message_type, topic, partial(self._take, part), node.value("latched_camera"))
+                topic, _ = _CAMERA[part]
+                node.input(topic, partial(self._take, part), from_driver=not node.value("latched_camera"))
         self.reset()
 
     def reset(self) -> None:
@@ -102,7 +101,7 @@ class ViewInputs:
 
     def _take(self, part: str, message: Any) -> None:
         require_frame(message.header, self._node.world_frame if part == "pose" else self._node.camera_frame)
-        self.add(part, stamp_to_ns(message.header.stamp), _CAMERA[part][2](message))
+        self.add(part, stamp_to_ns(message.header.stamp), _CAMERA[part][1](message))
 
     def _on_complete(self, stamp: int, values: dict[str, Any]) -> None:
         self._latest = stamp

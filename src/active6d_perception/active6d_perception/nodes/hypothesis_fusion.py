@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
 from sensor_msgs.msg import Image, PointCloud2
-from visualization_msgs.msg import MarkerArray
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.files import atomic_file, cache_folder
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
     OutdatedError,
     hypotheses_from_cloud,
@@ -54,15 +53,15 @@ class HypothesisFusionNode(GraphNode):
         self.declare("samples", 128, "largest number of scene points verified per hypothesis", minimum=1)
         self._declare_fusion()
         self._declare_workspace()
-        self._objects = self.output(PointCloud2, "objects", latched=True)
-        self._poses = self.output(PoseArray, "objects/poses", latched=True)
-        self._markers = self.output(MarkerArray, "objects/markers", latched=True)
-        self._unexplained = self.output(PointCloud2, "objects/unexplained", latched=True)
+        self._objects = self.output(topics.OBJECTS)
+        self._poses = self.output(topics.OBJECTS_POSES)
+        self._markers = self.output(topics.OBJECTS_MARKERS)
+        self._unexplained = self.output(topics.UNEXPLAINED)
         self._detections = DetectionOutput(self, "objects/detections")
         # First, for the executor calls back in this order: a new episode is known before its first view.
-        self.input(DiagnosticArray, "episode/start", self._on_episode_start, latched=True)
-        self.input(PointCloud2, "hypotheses", self._on_hypotheses, latched=True)
-        self.input(Image, "hypotheses/segmentation", self._on_segmentation, latched=True)
+        self.input(topics.EPISODE_START, self._on_episode_start)
+        self.input(topics.HYPOTHESES, self._on_hypotheses)
+        self.input(topics.SEGMENTATION, self._on_segmentation)
         self._inputs = ViewInputs(self, ("depth", "camera", "pose"), self._on_view, _OTHERS)
 
     def _declare_fusion(self) -> None:

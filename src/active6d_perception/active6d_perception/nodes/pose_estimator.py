@@ -4,12 +4,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from geometry_msgs.msg import PoseArray
-from sensor_msgs.msg import Image, PointCloud2
 
 from active6d_core.camera import View
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
+from active6d_core.ros import topics
 from active6d_core.ros.conversions import hypotheses_to_cloud, poses_to_array, segmentation_to_image
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
@@ -41,9 +40,9 @@ class PoseEstimatorNode(GraphNode):
             "use_camera_pose", False, "wait for the camera's pose too and pass it to the estimator", fixed=True
         )
         self._estimator: Estimator | None = None
-        self._hypotheses = self.output(PointCloud2, "hypotheses", latched=True)
-        self._poses = self.output(PoseArray, "hypotheses/poses", latched=True)
-        self._segmentation = self.output(Image, "hypotheses/segmentation", latched=True)
+        self._hypotheses = self.output(topics.HYPOTHESES)
+        self._poses = self.output(topics.HYPOTHESES_POSES)
+        self._segmentation = self.output(topics.SEGMENTATION)
         parts = ["color", "depth", "camera"] + ["pose"] * self.value("use_camera_pose")
         self._inputs = ViewInputs(self, parts, self._on_view)
 

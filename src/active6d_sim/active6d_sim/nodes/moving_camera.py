@@ -5,12 +5,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray, PoseStamped
-from sensor_msgs.msg import CameraInfo, Image
+from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 
 from active6d_core.camera import View
+from active6d_core.ros import topics
 from active6d_core.ros.clock_output import ClockOutput
 from active6d_core.ros.conversions import (
     MessageError,
@@ -53,15 +52,15 @@ class MovingCameraNode(GraphNode):
         self.declare("radius", 0.8, "radius of the hemisphere of views in metres", minimum=0.1)
         self._stamp = 0
         self._clock_output = ClockOutput(self)
-        self._color = self.output(Image, "camera/color/image_raw", latched=True)
-        self._depth = self.output(Image, "camera/depth/image_raw", latched=True)
-        self._info = self.output(CameraInfo, "camera/color/camera_info", latched=True)
-        self._pose = self.output(PoseStamped, "camera/pose", latched=True)
-        self._truth = self.output(PoseArray, "ground_truth/poses", latched=True)
-        self._start = self.output(DiagnosticArray, "episode/start", latched=True)
-        self._status = self.output(DiagnosticArray, "view_goal/status", latched=True)
+        self._color = self.output(topics.CAMERA_COLOR)
+        self._depth = self.output(topics.CAMERA_DEPTH)
+        self._info = self.output(topics.CAMERA_INFO)
+        self._pose = self.output(topics.CAMERA_POSE)
+        self._truth = self.output(topics.GROUND_TRUTH)
+        self._start = self.output(topics.EPISODE_START)
+        self._status = self.output(topics.GOAL_STATUS)
         self._transforms = TransformOutput(self)
-        self.input(PoseStamped, "view_goal", self._on_goal)
+        self.input(topics.VIEW_GOAL, self._on_goal)
         self.create_service(Trigger, "~/reset", self._on_reset)
 
     # What a subclass provides

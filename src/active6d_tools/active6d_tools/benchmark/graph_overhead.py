@@ -14,15 +14,14 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, Image
 
 from active6d_bringup.graph.composition import ComposedGraph, GraphDescription, running
 from active6d_bringup.graph.episode import EpisodeMonitor
 from active6d_core.camera import DEFAULT_CAMERA, View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
     camera_to_info,
     color_to_image,
@@ -71,13 +70,13 @@ class PreparedCamera(GraphNode):
         super().__init__("camera_simulator", **arguments)
         self._views = iter(views)
         self.times: list[float] = []
-        self._color = self.output(Image, "camera/color/image_raw", latched=True)
-        self._depth = self.output(Image, "camera/depth/image_raw", latched=True)
-        self._info = self.output(CameraInfo, "camera/color/camera_info", latched=True)
-        self._pose = self.output(PoseStamped, "camera/pose", latched=True)
-        self._start = self.output(DiagnosticArray, "episode/start", latched=True)
-        self.input(PoseStamped, "view_goal", self._on_goal)
-        self.input(DiagnosticArray, "episode/end", self._on_goal, latched=True)
+        self._color = self.output(topics.CAMERA_COLOR)
+        self._depth = self.output(topics.CAMERA_DEPTH)
+        self._info = self.output(topics.CAMERA_INFO)
+        self._pose = self.output(topics.CAMERA_POSE)
+        self._start = self.output(topics.EPISODE_START)
+        self.input(topics.VIEW_GOAL, self._on_goal)
+        self.input(topics.EPISODE_END, self._on_goal)
 
     def begin(self) -> None:
         """Announce the episode and publish the first view."""
