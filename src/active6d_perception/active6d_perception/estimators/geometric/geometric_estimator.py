@@ -3,18 +3,38 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.special import expit
 
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.geometric.foreground import Surface, measure_surface
+from active6d_perception.estimators.geometric.multi_start import (
+    MeasuredImage,
+    Starts,
+    compare,
+    image_of,
+    refine_projectively,
+    samples_of,
+    thin_out,
+)
 from active6d_perception.estimators.geometric.pair_voting import PairVoting
-from active6d_perception.estimators.refinement import Evidence, claim_pixels, refine, weigh_evidence
+from active6d_perception.estimators.refinement import claim_pixels
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
-from active6d_perception.suppression import suppress
+
+# Diameter for which the lengths below are given; they scale with the object, within what depth sensors resolve.
+_REFERENCE_DIAMETER = 0.14
+_SCALES = (0.35, 1.5)
+# Weight of a sample that the camera looked through against one that fits.
+_VIOLATION = 1.5
+# Starts kept at each measured point.
+_STARTS_PER_POINT = 24
+# Logistic regression of whether a pose is right, on the features of :meth:`GeometricEstimator.candidates`, fitted by
+# active6d_tools.studies.fit_geometric_score on validation views.
+_SCORE_WEIGHTS = np.array([2.56, -0.36, 4.60, 1.36, -0.28])
+_SCORE_OFFSET = -1.59
 
 
 @dataclass(frozen=True)
@@ -22,17 +42,17 @@ class GeometricParameters:
     """Settings of :class:`GeometricEstimator`.
 
     Attributes:
-        references: largest number of scene points that vote; the run time grows with it.
-        refined: largest number of candidates that are refined.
-        min_score: hypotheses with a lower score are not reported, in [0, 1].
+        references: most measured points that poses start from; time grows with it.
+        refined: most candidates that are refined in full.
+        min_score: hypotheses scoring less are not reported, in [0, 1].
 
     Raises:
         ValueError: a value is out of range.
     """
 
     references: int = 300
-    refined: int = 120
-    min_score: float = 0.3
+    refined: int = 600
+    min_score: float = 0.1
 
     def __post_init__(self) -> None:
         if self.references < 1 or self.refined < 1:
@@ -42,7 +62,7 @@ class GeometricParameters:
 
 
 class GeometricEstimator:
-    """Estimates poses by point-pair voting and visible-surface ICP, and scores them by inliers and free space.
+    """Many starts near the measured surface and from point-pair voting, projective ICP, a judge that knows free space.
 
     It is deterministic and single-threaded, and uses only the depth image and its intrinsics.
     """
@@ -52,74 +72,104 @@ class GeometricEstimator:
         self.parameters = parameters or GeometricParameters()
         self._views = model_views(model)
         self._voting = PairVoting(model)
+        self._starts = Starts(self._views)
         self._distance = SymmetricDistance(model)
+        self._samples = {count: samples_of(self._views, count) for count in (32, 64, 128, 256)}
+        self._scale = float(np.clip(model.diameter / _REFERENCE_DIAMETER, *_SCALES))
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimators.registry.Estimator.estimate`."""
         surface = measure_surface(view.depth, view.camera, self.model.diameter)
+        poses, label, features = self.candidates(surface)
+        score = expit(features @ _SCORE_WEIGHTS + _SCORE_OFFSET)
+        reported = np.flatnonzero(score >= self.parameters.min_score)
+        relabel = np.zeros(len(poses) + 1, np.uint16)
+        relabel[reported + 1] = np.arange(1, len(reported) + 1)
+        if not len(reported):
+            return Hypotheses.empty(view.camera.height, view.camera.width)
+        numbers = np.arange(1, len(reported) + 1)
+        return Hypotheses.from_masks(poses[reported], score[reported], numbers, relabel[label], view.depth)
+
+    def candidates(self, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Poses that explain pixels which no better one explains.
+
+        Returns:
+            (k, 4, 4) ``T_camera_object``; (H, W) uint16 label image, 1 + index of the pose and 0 for none; (k, 5)
+            features: fitting and violated shares, the fitting share of what is not occluded, the logarithm of the area
+            of its pixels over the diameter squared, and that area over the silhouette's part that is not occluded.
+        """
+        image = image_of(surface)
         poses = self._propose(surface)
         if len(poses):
-            poses = self._refine(surface, poses)
-        return self._report(surface, poses, view)
+            poses = refine_projectively(poses, self._samples[64], image, self._scale * np.array([0.02, 0.012]), 4)
+            poses = self._thin_out(poses, self._weigh(poses, image, 64, 0.008, 0.6), 0.06, self.parameters.refined, 15)
+            gates = self._scale * np.array([0.012, 0.008, 0.006])
+            poses = refine_projectively(poses, self._samples[128], image, gates, 5)
+            poses = self._thin_out(poses, self._weigh(poses, image, 256, 0.006, 0.7), 0.1, 300, 3)
+        shares = self._weigh(poses, image, 256, 0.006, 0.7)
+        # By the area that a pose explains, not by its share: a mug turned so that its handle would be hidden fits
+        # perfectly, and leaves the handle that was measured unexplained.
+        area = _value(shares) * self._views.visible.sum(axis=1)[self._views.nearest_direction(poses)]
+        best = np.argsort(-area, kind="stable")
+        best = best[_value(shares)[best] > 0.1]
+        label = claim_pixels(self._views, poses[best], surface.points, surface.foreground, surface.camera)
+        pixels = np.bincount(label.ravel(), minlength=len(best) + 1)[1:]
+        claimed = np.flatnonzero(pixels)
+        relabel = np.zeros(len(best) + 1, np.uint16)
+        relabel[claimed + 1] = np.arange(1, len(claimed) + 1)
+        poses, shares = poses[best[claimed]], shares[best[claimed]]
+        # The area that its pixels cover at the object's distance, in squares of the diameter: the same for all cameras.
+        pixel_area = poses[:, 2, 3] ** 2 / (surface.camera.fx * surface.camera.fy)
+        covered = pixels[claimed] * pixel_area
+        share = covered / self.model.diameter**2
+        silhouette = self._silhouette_area(poses)
+        unoccluded = np.maximum(1.0 - shares[:, 2], 0.1)
+        features = np.column_stack(
+            [shares[:, 0], shares[:, 1], shares[:, 0] / unoccluded, np.log(share), covered / (silhouette * unoccluded)]
+        )
+        return poses, relabel[label], features
 
     def _propose(self, surface: Surface) -> np.ndarray:
-        """(k, 4, 4) distinct candidates with the best evidence in the depth image, best first."""
+        """(k, 4, 4) starting poses that the depth image does not contradict."""
         usable = surface.foreground & np.isfinite(surface.normals).all(axis=-1)
-        index = _thin_out(surface, usable, 0.05 * self.model.diameter)
+        index = _one_a_cube(surface, usable, 0.05 * self.model.diameter)
         if len(index) < 10:
             return np.zeros((0, 4, 4))
         points = surface.points.reshape(-1, 3)[index].astype(float)
         normals = surface.normals.reshape(-1, 3)[index].astype(float)
         count = min(self.parameters.references, len(points))
         references = np.linspace(0, len(points) - 1, count).astype(np.intp)
-        poses, _ = self._voting.candidates(points, normals, references, peaks=3)
-        value = _value(self._weigh(surface, poses, samples=64, tolerance=0.010))
-        best = np.argsort(-value, kind="stable")[: 5 * self.parameters.refined]
-        poses, value = poses[best], value[best]
-        kept = suppress(self._distance.between(poses, poses), value, 0.08 * self.model.diameter)
-        return poses[kept[: self.parameters.refined]]
+        voted, _ = self._voting.candidates(points, normals, references, peaks=3)
+        starts = self._starts.at(points[references], normals[references])
+        image = image_of(surface)
+        value = _value(self._weigh(starts.reshape(-1, 4, 4), image, 32, 0.010, 0.5)).reshape(starts.shape[:2])
+        best = np.argsort(-value, axis=1, kind="stable")[:, :_STARTS_PER_POINT]
+        near = np.take_along_axis(starts, best[..., None, None], axis=1).reshape(-1, 4, 4)
+        poses = np.concatenate([near, voted])
+        return poses[_value(self._weigh(poses, image, 32, 0.010, 0.5)) > 0.05]
 
-    def _refine(self, surface: Surface, poses: np.ndarray) -> np.ndarray:
-        """(k, 4, 4) refined poses without duplicates, best first."""
-        usable = np.isfinite(surface.normals).all(axis=-1) & surface.foreground
-        usable[1::2] = usable[:, 1::2] = False
-        scene, normals = cKDTree(surface.points[usable]), surface.normals[usable]
-        poses = refine(self._views, poses, scene, normals, gates=(0.012, 0.008), iterations=4, samples=96)
-        value = _value(self._weigh(surface, poses))
-        kept = suppress(self._distance.between(poses, poses), value, 0.08 * self.model.diameter)
-        kept = kept[value[kept] > 0.1]
-        poses = refine(self._views, poses[kept], scene, normals, gates=(0.008, 0.004), iterations=4)
-        value = _value(self._weigh(surface, poses))
-        kept = suppress(self._distance.between(poses, poses), value, 0.1 * self.model.diameter)
-        return poses[kept[value[kept] > 0.1]]
+    def _silhouette_area(self, poses: np.ndarray) -> np.ndarray:
+        """(k,) area of the model's silhouette at its distance, without occlusion, square metres."""
+        direction = self._views.nearest_direction(poses)
+        cosine = np.maximum(self._views.directions[direction] @ self._views.normals.T, 0.0)
+        return (self._views.visible[direction] * cosine).sum(axis=1) * np.pi * self._views.spacing**2
 
-    def _report(self, surface: Surface, poses: np.ndarray, view: View) -> Hypotheses:
-        """The hypotheses that explain pixels which no better one explains."""
-        if not len(poses):
-            return Hypotheses.empty(view.camera.height, view.camera.width)
-        score = _value(self._weigh(surface, poses, samples=512))
-        # Ranked by the area that a pose explains and not by its share. A mug rotated so that its handle would be hidden
-        # fits perfectly, but leaves the measured handle unexplained.
-        area = score * self._views.visible.sum(axis=1)[self._views.nearest_direction(poses)]
-        best = np.argsort(-area, kind="stable")
-        best = best[score[best] >= self.parameters.min_score]
-        label = claim_pixels(self._views, poses[best], surface.points, surface.foreground, view.camera)
-        claimed = np.unique(label[label > 0])
-        reported = best[claimed.astype(np.intp) - 1]
-        relabel = np.zeros(len(best) + 1, np.uint16)
-        relabel[claimed] = np.arange(1, len(claimed) + 1)
-        return Hypotheses.from_masks(poses[reported], score[reported], relabel[claimed], relabel[label], view.depth)
+    def _weigh(
+        self, poses: np.ndarray, image: MeasuredImage, samples: int, tolerance: float, alike: float
+    ) -> np.ndarray:
+        return compare(poses, self._samples[samples], image, self._scale * tolerance, alike)
 
-    def _weigh(self, surface: Surface, poses: np.ndarray, **settings) -> Evidence:
-        return weigh_evidence(self._views, poses, surface.depth, surface.normals, surface.camera, **settings)
+    def _thin_out(self, poses: np.ndarray, shares: np.ndarray, radius: float, most: int, quota: int) -> np.ndarray:
+        radius *= self.model.diameter
+        return poses[thin_out(poses, _value(shares), self._distance, radius, most=most, quota=quota)]
 
 
-def _value(evidence: Evidence) -> np.ndarray:
-    return np.clip(evidence.fitting - evidence.violated, 0.0, 1.0)
+def _value(shares: np.ndarray) -> np.ndarray:
+    return shares[:, 0] - _VIOLATION * shares[:, 1]
 
 
-def _thin_out(surface: Surface, usable: np.ndarray, spacing: float) -> np.ndarray:
-    """Flat indices of usable pixels, one per cube of edge ``spacing`` metres."""
+def _one_a_cube(surface: Surface, usable: np.ndarray, spacing: float) -> np.ndarray:
+    """Flat indices of usable pixels, about one for each cube of that edge in metres."""
     index = np.flatnonzero(usable)
     cell = np.floor(surface.points.reshape(-1, 3)[index] / spacing).astype(np.int64)
     key = (cell[:, 0] * 4096 + cell[:, 1]) * 4096 + cell[:, 2]
