@@ -63,8 +63,6 @@ def test_finds_a_lone_object(name):
         assert np.nanmean(view.depth[mask]) == pytest.approx(found.depth[best])
 
 
-# Measured on these two views by ADD-S: 16 of 20, 9 of 9 and 14 of 17 found, and every hypothesis right. One or two
-# objects may be lost before the test fails. On 12 views of two heaps it is .93, .72, .88 (docs/perception.md).
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "found"), [("coffee_cup", 0.70), ("bunny", 0.85), ("mug", 0.75)])
 def test_finds_most_of_what_a_heap_shows(name, found):
