@@ -32,6 +32,7 @@ setup(
         "rosbags",
         "scipy",
         "torch",
+        "trimesh",
         "typer",
     ],
     entry_points={"console_scripts": ["active6d = active6d_tools.cli:main"]},

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, ReaderError
 
+from active6d_bringup.bags.index import BagError, BagIndex, read_bag
 from active6d_bringup.bags.writer import TYPESTORE
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses, SceneObjects
@@ -30,13 +29,15 @@ from active6d_core.ros.conversions import (
     poses_from_array,
     stamp_to_ns,
 )
-from active6d_core.ros.topics import CAMERA_POSE, CAMERA_TOPICS, CONTRACT, EPISODE_END, EPISODE_START, GROUND_TRUTH
-
-_POSE_ENDING = f"/{CAMERA_POSE.name}"
-
-
-class BagError(ValueError):
-    """A bag that cannot be read as an episode; the text names the folder and says what to do."""
+from active6d_core.ros.topics import (
+    CAMERA_POSE,
+    CAMERA_TOPICS,
+    DIAGNOSTICS,
+    EPISODE_END,
+    EPISODE_START,
+    GROUND_TRUTH,
+    OBJECTS_MARKERS,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,18 +117,18 @@ class EpisodeRecord:
         return np.array([step.view.T_world_camera[:3, 3] for step in self.steps]).reshape(-1, 3)
 
 
-def read_episodes(folder: Path | str) -> list[EpisodeRecord]:
-    """Every episode of a bag, in order; a bag without ``episode/start`` is one episode.
+def read_episodes(bag: Path | str | BagIndex) -> list[EpisodeRecord]:
+    """Every episode of a bag or of its index, in order; a bag without ``episode/start`` is one episode.
 
     Raises:
         BagError: no bag, a broken one, or one without a complete view.
     """
-    folder = Path(folder)
-    messages, latencies = _read_messages(folder)
+    index = bag if isinstance(bag, BagIndex) else read_bag(Path(bag))
+    messages, latencies = _read_messages(index)
     try:
-        return _episodes(folder, messages, latencies)
+        return _episodes(index.folder, messages, latencies)
     except MessageError as error:
-        raise BagError(f"{folder}: {error}") from error
+        raise BagError(f"{index.folder}: {error}") from error
 
 
 def read_episode(folder: Path | str) -> EpisodeRecord:
@@ -139,67 +140,17 @@ def read_episode(folder: Path | str) -> EpisodeRecord:
     return read_episodes(folder)[0]
 
 
-def open_bag(folder: Path) -> Reader:
-    """A rosbags reader for use in a ``with`` statement.
-
-    Raises:
-        BagError: no bag there, or one whose recording was cut off.
-    """
-    if not folder.is_dir():
-        raise BagError(f"{folder}: no such folder; name the folder of a bag, the one with metadata.yaml in it")
-    if not (folder / "metadata.yaml").is_file():
-        cut_off = any(folder.glob("*.mcap"))
-        hint = "its recording was killed; `mcap recover` saves what is there" if cut_off else "this is not a bag"
-        raise BagError(f"{folder}: no metadata.yaml; {hint}")
-    try:
-        return Reader(folder)
-    except (ReaderError, OSError) as error:
-        raise BagError(f"{folder}: {error}") from error
-
-
-def topic_names(connections: list[Connection], folder: Path) -> dict[str, str]:
-    """Recorded topic to its name in the contract, for the topics of the contract, whatever their namespace.
-
-    Raises:
-        BagError: the bag has no camera pose, or several (more than one namespace).
-    """
-    poses = sorted({connection.topic for connection in connections if connection.topic.endswith(_POSE_ENDING)})
-    if len(poses) != 1:
-        found = f"several namespaces ({', '.join(poses)})" if poses else f"no topic {CAMERA_POSE.name}"
-        raise BagError(f"{folder}: has {found}; it is not an episode of active6d")
-    prefix = poses[0].removesuffix(CAMERA_POSE.name)
-    known = {topic.name if topic.name.startswith("/") else prefix + topic.name: topic for topic in CONTRACT}
-    wrong = [
-        connection
-        for connection in connections
-        if connection.topic in known and connection.msgtype != known[connection.topic].type
-    ]
-    if wrong:
-        expected = known[wrong[0].topic].type
-        raise BagError(f"{folder}: {wrong[0].topic} holds {wrong[0].msgtype}, expected {expected}")
-    return {name: topic.name for name, topic in known.items()}
-
-
-def _read_messages(folder: Path) -> tuple[dict[str, dict[int, Any]], dict[int, dict[str, float]]]:
-    """Topic and stamp to message (the last one of a stamp), and stamp and node to milliseconds."""
+def _read_messages(index: BagIndex) -> tuple[dict[str, dict[int, Any]], dict[int, dict[str, float]]]:
+    """Topic and stamp to message, and stamp and node to milliseconds."""
     messages: dict[str, dict[int, Any]] = defaultdict(dict)
+    messages |= {topic: index.messages(topic) for topic in index.payloads if topic != OBJECTS_MARKERS.name}
     latencies: dict[int, dict[str, float]] = defaultdict(dict)
-    try:
-        with open_bag(folder) as reader:
-            names = topic_names(reader.connections, folder)
-            wanted = [connection for connection in reader.connections if connection.topic in names]
-            for connection, _, payload in reader.messages(wanted):
-                message: Any = TYPESTORE.deserialize_cdr(payload, connection.msgtype)
-                topic = names[connection.topic]
-                if topic == "/diagnostics":
-                    latencies[stamp_to_ns(message.header.stamp)].update(latencies_from_diagnostics(message))
-                elif hasattr(message, "header"):
-                    messages[topic][stamp_to_ns(message.header.stamp)] = message
-    except BagError:
-        raise
-    # A damaged file fails anywhere in its decoding, with the error of whichever library was at work.
-    except Exception as error:
-        raise BagError(f"{folder}: damaged bag ({error})") from error
+    for payload in index.diagnostics:
+        try:
+            message: Any = TYPESTORE.deserialize_cdr(payload, DIAGNOSTICS.type)
+        except Exception as error:
+            raise BagError(f"{index.folder}: damaged message of {DIAGNOSTICS.name} ({error})") from error
+        latencies[stamp_to_ns(message.header.stamp)].update(latencies_from_diagnostics(message))
     return messages, latencies
 
 

@@ -1,6 +1,5 @@
 """A recorded episode's camera through live perception, and whether what comes out equals what was recorded."""
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from active6d_bringup.bags.reader import BagError, open_bag, read_episodes, topic_names
-from active6d_bringup.bags.writer import SETTINGS, TYPESTORE, stamp_of
+from active6d_bringup.bags.index import BagError, read_bag
+from active6d_bringup.bags.reader import read_episodes
+from active6d_bringup.bags.writer import TYPESTORE, stamp_of
 from active6d_bringup.graph.composition import GraphDescription, OnEvent, default_params_file, running
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
 from active6d_core.ros.conversions import read_table
@@ -120,10 +119,10 @@ def replay(
         EpisodeError: perception does not answer.
         EpisodeInterrupted: by Ctrl-C or SIGTERM.
     """
-    episodes = read_episodes(settings.bag)
+    index = read_bag(settings.bag)
+    episodes = read_episodes(index)
     stamps = [step.stamp for episode in episodes for step in episode.steps]
-    recorded = _read_compared(settings.bag)
-    description = describe(settings, episodes[0].object)
+    description = describe(settings, episodes[0].object, index.settings)
     with interruptible() as interrupted, running(make_graph(settings, description, on_event)) as graph:
         listener = _Listener(graph.context)
         graph.add(listener)
@@ -142,15 +141,17 @@ def replay(
         seconds = time.monotonic() - started
         on_view(len(stamps), len(stamps))
     comparisons = [
-        compare(stamp, topic, recorded.get((topic, stamp)), listener.payloads[topic, stamp])
+        compare(stamp, topic, index.payloads.get(topic, {}).get(stamp), listener.payloads[topic, stamp])
         for stamp in stamps
         for topic in COMPARED
     ]
     return ReplayResult(len(stamps), comparisons, seconds)
 
 
-def describe(settings: ReplaySettings, recorded_object: str | None) -> GraphDescription:
-    """The graph of a replay: a player in the camera's place, and perception as it was told when recording.
+def describe(
+    settings: ReplaySettings, recorded_object: str | None, recorded: dict[str, dict[str, Any]]
+) -> GraphDescription:
+    """The graph of a replay: a player in the camera's place, and perception with its recorded parameters.
 
     Raises:
         BagError: neither the settings nor the bag name the object.
@@ -158,14 +159,13 @@ def describe(settings: ReplaySettings, recorded_object: str | None) -> GraphDesc
     name = settings.object or recorded_object
     if name is None:
         raise BagError(f"{settings.bag}: does not name its object; say which it is with --object")
-    told = _read_settings(settings.bag)
-    estimator = {**told.get("pose_estimator", {}), "object": name}
+    estimator = {**recorded.get("pose_estimator", {}), "object": name}
     if settings.estimator is not None:
         estimator["estimator"] = settings.estimator
     nodes = {
         "bag_player": {"bag": str(settings.bag), "rate": float(settings.rate)},
         "pose_estimator": estimator,
-        "hypothesis_fusion": {**told.get("hypothesis_fusion", {}), "object": name},
+        "hypothesis_fusion": {**recorded.get("hypothesis_fusion", {}), "object": name},
     }
     nodes = {name: {**parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
     return GraphDescription(nodes, settings.params_file or default_params_file(), domain=settings.domain)
@@ -197,30 +197,6 @@ def _differences(expected: Any, found: Any) -> dict[str, float]:
         name: np.abs(tables[0][name].astype(float) - tables[1][name]).max(initial=0.0) for name in tables[0].dtype.names
     }
     return {name: float(difference) for name, difference in largest.items() if difference != 0}
-
-
-def _read_settings(folder: Path) -> dict[str, dict[str, Any]]:
-    """What the nodes were told when recording; nothing where the bag's metadata does not say."""
-    metadata = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
-    try:
-        settings = json.loads((metadata.get("custom_data") or {})[SETTINGS])
-    except (KeyError, TypeError, json.JSONDecodeError):
-        return {}
-    if not isinstance(settings, dict):
-        return {}
-    return {node: parameters for node, parameters in settings.items() if isinstance(parameters, dict)}
-
-
-def _read_compared(folder: Path) -> dict[tuple[str, int], bytes]:
-    """(topic, stamp) to the recorded payload, the last one of a stamp."""
-    payloads = {}
-    with open_bag(folder) as reader:
-        names = topic_names(reader.connections, folder)
-        wanted = [connection for connection in reader.connections if names.get(connection.topic) in COMPARED]
-        for connection, _, payload in reader.messages(wanted):
-            topic = names[connection.topic]
-            payloads[topic, stamp_of(connection.msgtype, payload)] = bytes(payload)
-    return payloads
 
 
 class _Listener(Node):

@@ -6,8 +6,7 @@ from pathlib import Path
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
-from active6d_bringup.bags.reader import BagError, open_bag, topic_names
-from active6d_bringup.bags.writer import stamp_of
+from active6d_bringup.bags.index import BagError, read_bag
 from active6d_core.ros import topics
 from active6d_core.ros.clock_output import ClockOutput
 from active6d_core.ros.conversions import stamp_to_ns
@@ -98,18 +97,11 @@ class BagPlayerNode(GraphNode):
 
 def _read_views(folder: Path) -> tuple[dict[int, dict[str, bytes]], dict[int, int]]:
     """Per complete view's stamp: its serialized messages by topic, and when (ns) its pose was recorded."""
-    types = {topic.name: topic.type for topic in topics.REPLAYED_TOPICS}
+    index = read_bag(folder)
     views: dict[int, dict[str, bytes]] = defaultdict(dict)
-    received: dict[int, int] = {}
-    with open_bag(folder) as reader:
-        names = topic_names(reader.connections, folder)
-        wanted = [item for item in reader.connections if names.get(item.topic) in types]
-        for connection, timestamp, payload in reader.messages(wanted):
-            topic = names[connection.topic]
-            stamp = stamp_of(types[topic], payload)
-            views[stamp][topic] = bytes(payload)
-            if topic == "camera/pose":
-                received[stamp] = timestamp
+    for topic in topics.REPLAYED_TOPICS:
+        for stamp, payload in index.payloads.get(topic.name, {}).items():
+            views[stamp][topic.name] = payload
     complete = {
         stamp: messages
         for stamp, messages in views.items()
@@ -117,7 +109,7 @@ def _read_views(folder: Path) -> tuple[dict[int, dict[str, bytes]], dict[int, in
     }
     if not complete:
         raise BagError(f"{folder}: holds no complete view (color, depth, camera_info and pose of one stamp)")
-    return complete, received
+    return complete, index.received[topics.CAMERA_POSE.name]
 
 
 def main() -> None:
