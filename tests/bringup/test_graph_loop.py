@@ -1,6 +1,8 @@
 """The whole loop with the real nodes: every number in the bag against the core functions called by hand."""
 
 import io
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -195,3 +197,42 @@ def test_replay_through_live_perception_is_equal(bags):
     result = replay(ReplaySettings(bags[0], domain=fresh_domain()))
     assert result.equal, result.largest_differences()
     assert result.views == MOVES + 1
+
+
+# What a robot does not install; None makes an import fail.
+ROBOT = """
+import sys
+
+for name in ("gymnasium", "stable_baselines3", "pybullet", "active6d_sim", "active6d_tools"):
+    sys.modules[name] = None
+
+import time
+from pathlib import Path
+
+from active6d_bringup.graph.composition import ComposedGraph, GraphDescription, running
+
+bag, copy, domain, moves = sys.argv[1:]
+nodes = {
+    "bag_player": {"bag": bag},
+    "pose_estimator": {"object": "mug", "estimator": "geometric"},
+    "hypothesis_fusion": {"object": "mug"},
+    "attention_policy": {"object": "mug", "policy": "view-attention", "steps": int(moves)},
+    "episode_recorder": {"bag": copy},
+}
+with running(ComposedGraph(GraphDescription(nodes, domain=int(domain)))) as graph:
+    graph.start()
+    recorder, deadline = graph.nodes["episode_recorder"], time.monotonic() + 60
+    while recorder._writer.last_end is None and time.monotonic() < deadline:
+        graph.spin_once(0.1)
+"""
+
+
+def test_a_robot_without_simulator_and_trainer_runs_an_episode_from_a_bag(bags, record, tmp_path):
+    copy = tmp_path / "copy"
+    command = [sys.executable, "-c", ROBOT, str(bags[0]), str(copy), str(fresh_domain()), str(MOVES)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+    assert done.returncode == 0, done.stderr
+    played = read_episode(copy)
+    assert [step.stamp for step in played.steps] == [step.stamp for step in record.steps]
+    for step, expected in zip(played.steps, record.steps, strict=True):
+        np.testing.assert_array_equal(step.objects.T_world_object, expected.objects.T_world_object)

@@ -2,9 +2,12 @@
 
 import ast
 import runpy
+import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
+from ament_index_python.packages import PackageNotFoundError
 
 from active6d_core.ros.graph_nodes import NODES
 
@@ -63,3 +66,37 @@ def test_it_loads_where_launch_is_installed():
     names = runpy.run_path(str(LAUNCH))
     arguments = names["generate_launch_description"]().get_launch_arguments()
     assert {argument.name for argument in arguments} == set(names["ARGUMENTS"])
+
+
+@pytest.fixture
+def refuse(monkeypatch):
+    """The launch file's check before anything starts; ``launch`` itself is replaced, since it need not be installed."""
+    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    monkeypatch.setitem(sys.modules, "launch_ros.parameter_descriptions", MagicMock())
+    installed = {"active6d_bringup": str(LAUNCH.parents[1])}
+
+    def share(package: str) -> str:
+        if package not in installed:
+            raise PackageNotFoundError(package)
+        return installed[package]
+
+    monkeypatch.setattr("ament_index_python.packages.get_package_share_directory", share)
+    names = runpy.run_path(str(LAUNCH))
+    defaults = {name: default for name, (default, _, _) in names["ARGUMENTS"].items()}
+    return lambda **given: names["_refuse_what_cannot_work"]({**defaults, **given})
+
+
+@pytest.mark.parametrize(
+    ("given", "cause"),
+    [
+        ({"rviz": "true"}, "rviz:=true needs rviz2"),
+        ({"object": "teapot"}, "object:=teapot: unknown object 'teapot'"),
+        ({"camera": "bag"}, "camera:=bag needs play:=FOLDER"),
+        ({"params_file": "nowhere.yaml"}, "params_file:=nowhere.yaml does not exist"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_anything_starts(refuse, given, cause):
+    refuse(object="mug", camera="bag", play="bags/mine")
+    with pytest.raises(RuntimeError, match=cause):
+        refuse(**given)
