@@ -4,12 +4,13 @@ import ast
 import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
 from ament_index_python.packages import PackageNotFoundError
 
-from active6d_core.ros.graph_nodes import NODES
+from active6d_core.ros.graph_nodes import BAD_PARAMETERS, NODES
 
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "src/active6d_bringup/launch/active6d.launch.py"
@@ -69,11 +70,13 @@ def test_it_loads_where_launch_is_installed():
 
 
 @pytest.fixture
-def refuse(monkeypatch):
-    """The launch file's check before anything starts; ``launch`` itself is replaced, since it need not be installed."""
-    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
+def names(monkeypatch):
+    """The launch file's functions; ``launch`` itself is replaced, since it need not be installed."""
+    parts = ["actions", "event_handlers", "events", "events.process", "substitutions"]
+    for name in ["launch", *(f"launch.{part}" for part in parts)]:
         monkeypatch.setitem(sys.modules, name, MagicMock())
-    monkeypatch.setitem(sys.modules, "launch_ros.parameter_descriptions", MagicMock())
+    for name in ("launch_ros", "launch_ros.actions", "launch_ros.parameter_descriptions"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
     installed = {"active6d_bringup": str(LAUNCH.parents[1])}
 
     def share(package: str) -> str:
@@ -82,7 +85,12 @@ def refuse(monkeypatch):
         return installed[package]
 
     monkeypatch.setattr("ament_index_python.packages.get_package_share_directory", share)
-    names = runpy.run_path(str(LAUNCH))
+    return runpy.run_path(str(LAUNCH))
+
+
+@pytest.fixture
+def refuse(names):
+    """The launch file's check before anything starts."""
     defaults = {name: default for name, (default, _, _) in names["ARGUMENTS"].items()}
     return lambda **given: names["_refuse_what_cannot_work"]({**defaults, **given})
 
@@ -100,3 +108,9 @@ def test_what_cannot_work_is_refused_before_anything_starts(refuse, given, cause
     refuse(object="mug", camera="bag", play="bags/mine")
     with pytest.raises(RuntimeError, match=cause):
         refuse(**given)
+
+
+@pytest.mark.parametrize(("code", "ends"), [(BAD_PARAMETERS, True), (0, False), (1, False), (-9, False)])
+def test_a_node_that_refuses_its_parameters_ends_the_launch(names, code, ends):
+    event = SimpleNamespace(returncode=code, process_name="pose_estimator-1")
+    assert bool(names["_end_on_bad_parameters"](event, None)) is ends

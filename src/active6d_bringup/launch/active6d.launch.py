@@ -4,13 +4,16 @@ from pathlib import Path
 
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction, RegisterEventHandler
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from active6d_core.object_model import load_object
-from active6d_core.ros.graph_nodes import MAX_RESTARTS, NODES
+from active6d_core.ros.graph_nodes import BAD_PARAMETERS, MAX_RESTARTS, NODES
 
 SHARE = Path(get_package_share_directory("active6d_bringup"))
 
@@ -67,11 +70,18 @@ def _node(executable: str, given: dict[str, str]) -> Node:
         namespace=given["namespace"],
         parameters=[given["params_file"], parameters],
         output="screen",
-        # A node that refuses its parameters (BAD_PARAMETERS) ends within a second; few retries bound that, too.
         respawn=entry.restarted,
+        # Longer than the shutdown takes that _end_on_bad_parameters asks for.
         respawn_delay=1.0,
         respawn_max_retries=MAX_RESTARTS,
     )
+
+
+def _end_on_bad_parameters(event: ProcessExited, context: LaunchContext) -> list[EmitEvent]:
+    """End the launch when a node refuses its parameters: starting it again cannot succeed."""
+    if event.returncode != BAD_PARAMETERS:
+        return []
+    return [EmitEvent(event=Shutdown(reason=f"{event.process_name} refuses its parameters, see its message above"))]
 
 
 def _refuse_what_cannot_work(given: dict[str, str]) -> None:
@@ -115,4 +125,5 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(name, default_value=default, choices=choices, description=description)
         for name, (default, choices, description) in ARGUMENTS.items()
     ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=_graph)])
+    handler = RegisterEventHandler(OnProcessExit(on_exit=_end_on_bad_parameters))
+    return LaunchDescription([*arguments, handler, OpaqueFunction(function=_graph)])
