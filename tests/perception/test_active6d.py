@@ -69,16 +69,16 @@ def test_poses_of_the_mesh_file_place_the_file_where_the_object_is(tmp_path, mon
     """A part modelled far from the file's origin, in millimetres: the file's vertices land on the object."""
     part = trimesh.creation.box((30.0, 50.0, 90.0))
     part.apply_translation((400.0, -120.0, 15.0))
-    part.export(tmp_path / "brick.stl")
-    (tmp_path / "brick.yaml").write_text(
-        "name: brick\nmesh: brick.stl\nscale: 0.001\ninstances: [2, 5]\ncolor: [0.5, 0.5, 0.5]\n"
+    part.export(tmp_path / "offset_brick.stl")
+    (tmp_path / "offset_brick.yaml").write_text(
+        "name: offset_brick\nmesh: offset_brick.stl\nscale: 0.001\ninstances: [2, 5]\ncolor: [0.5, 0.5, 0.5]\n"
     )
     monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path))
-    model = load_object("brick")
+    model = load_object("offset_brick")
     c, s = np.cos(0.3), np.sin(0.3)
     T_camera_object = np.array([[[c, -s, 0, 0.1], [s, c, 0, -0.05], [0, 0, 1, 0.8], [0, 0, 0, 1]]])
     T = model.T_camera_mesh(T_camera_object)[0]
-    from_file = 1e-3 * np.asarray(trimesh.load_mesh(tmp_path / "brick.stl").vertices) @ T[:3, :3].T + T[:3, 3]
+    from_file = 1e-3 * np.asarray(trimesh.load_mesh(tmp_path / "offset_brick.stl").vertices) @ T[:3, :3].T + T[:3, 3]
     np.testing.assert_allclose(from_file.mean(axis=0), [0.1, -0.05, 0.8], atol=1e-9)
     corners = np.asarray(model.mesh.vertices) @ T_camera_object[0, :3, :3].T + T_camera_object[0, :3, 3]
     for corner in from_file:

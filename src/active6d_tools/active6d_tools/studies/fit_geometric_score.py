@@ -1,6 +1,6 @@
 """Fit the score of the training-free estimator: a logistic regression of whether a candidate pose is right.
 
-Usage: python -m active6d_tools.studies.fit_geometric_score [--views N]
+Example: python -m active6d_tools.studies.fit_geometric_score --views 18
 
 Candidates come from validation views of the shipped objects, where poses are known. Views of other objects, and
 pictures of random boxes, cylinders, cones and walls, hold no object that is looked for: all candidates there are wrong.
