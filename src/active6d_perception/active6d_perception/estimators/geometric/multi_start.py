@@ -135,7 +135,7 @@ def compare(T: np.ndarray, samples: VisibleSamples, image: MeasuredImage, tolera
 
 
 @compiled
-def refine_projectively(  # noqa: C901  (as compare)
+def refine_projectively(
     T: np.ndarray, samples: VisibleSamples, image: MeasuredImage, gates: np.ndarray, iterations: int
 ) -> np.ndarray:
     """Point-to-plane ICP where each visible sample is paired with the measurement at its own pixel.
@@ -150,45 +150,14 @@ def refine_projectively(  # noqa: C901  (as compare)
     Returns:
         (k, 4, 4) refined poses; one with fewer than 6 pairs stays as it was.
     """
-    height, width = image.points.shape[:2]
     result = T.copy()
     for k in range(len(T)):
         P = result[k]
         for gate in gates:
             direction = _nearest_direction(P, samples.directions)
             for _ in range(iterations):
-                A, g, pairs = np.zeros((6, 6)), np.zeros(6), 0
-                for place in range(samples.count[direction]):
-                    s = samples.index[direction, place]
-                    a, b, c = samples.points[s, 0], samples.points[s, 1], samples.points[s, 2]
-                    # arm from the object's origin, and the sample itself
-                    ax = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c
-                    ay = P[1, 0] * a + P[1, 1] * b + P[1, 2] * c
-                    az = P[2, 0] * a + P[2, 1] * b + P[2, 2] * c
-                    x, y, z = ax + P[0, 3], ay + P[1, 3], az + P[2, 3]
-                    if z < 1e-3:
-                        continue
-                    u, v = int(np.rint(x / z * image.fx + image.cx)), int(np.rint(y / z * image.fy + image.cy))
-                    if u < 0 or v < 0 or u >= width or v >= height or not np.isfinite(image.points[v, u, 2]):
-                        continue
-                    d, e, f = samples.normals[s, 0], samples.normals[s, 1], samples.normals[s, 2]
-                    nx = P[0, 0] * d + P[0, 1] * e + P[0, 2] * f
-                    ny = P[1, 0] * d + P[1, 1] * e + P[1, 2] * f
-                    nz = P[2, 0] * d + P[2, 1] * e + P[2, 2] * f
-                    qx, qy, qz = image.points[v, u, 0] - x, image.points[v, u, 1] - y, image.points[v, u, 2] - z
-                    if qx * qx + qy * qy + qz * qz > gate * gate:
-                        continue
-                    m = image.normals[v, u]
-                    if not (m[0] * nx + m[1] * ny + m[2] * nz > 0.5):
-                        continue
-                    residual = qx * nx + qy * ny + qz * nz
-                    J = (ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx, nx, ny, nz)
-                    for i in range(6):
-                        g[i] += J[i] * residual
-                        for j in range(i, 6):
-                            A[i, j] += J[i] * J[j]
-                    pairs += 1
-                if pairs < 6:
+                A, g = np.zeros((6, 6)), np.zeros(6)
+                if _add_pairs(P, direction, samples, image, gate, A, g) < 6:
                     break
                 trace = 0.0
                 for i in range(6):
@@ -198,9 +167,54 @@ def refine_projectively(  # noqa: C901  (as compare)
                 # A direction that the samples leave free (the axis of a cup) must not move; damping holds it.
                 for i in range(6):
                     A[i, i] += 1e-4 * trace / 6 + 1e-12
-                step = np.linalg.solve(A, g)
-                _move(P, step)
+                _move(P, np.linalg.solve(A, g))
     return result
+
+
+@compiled
+def _add_pairs(
+    P: np.ndarray,
+    direction: int,
+    samples: VisibleSamples,
+    image: MeasuredImage,
+    gate: float,
+    A: np.ndarray,
+    g: np.ndarray,
+) -> int:
+    """Add the upper half of the normal equations of one (4, 4) pose to (6, 6) ``A`` and (6,) ``g``; number of pairs."""
+    height, width = image.points.shape[:2]
+    pairs = 0
+    for place in range(samples.count[direction]):
+        s = samples.index[direction, place]
+        a, b, c = samples.points[s, 0], samples.points[s, 1], samples.points[s, 2]
+        # arm from the object's origin, and the sample itself
+        ax = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c
+        ay = P[1, 0] * a + P[1, 1] * b + P[1, 2] * c
+        az = P[2, 0] * a + P[2, 1] * b + P[2, 2] * c
+        x, y, z = ax + P[0, 3], ay + P[1, 3], az + P[2, 3]
+        if z < 1e-3:
+            continue
+        u, v = int(np.rint(x / z * image.fx + image.cx)), int(np.rint(y / z * image.fy + image.cy))
+        if u < 0 or v < 0 or u >= width or v >= height or not np.isfinite(image.points[v, u, 2]):
+            continue
+        d, e, f = samples.normals[s, 0], samples.normals[s, 1], samples.normals[s, 2]
+        nx = P[0, 0] * d + P[0, 1] * e + P[0, 2] * f
+        ny = P[1, 0] * d + P[1, 1] * e + P[1, 2] * f
+        nz = P[2, 0] * d + P[2, 1] * e + P[2, 2] * f
+        qx, qy, qz = image.points[v, u, 0] - x, image.points[v, u, 1] - y, image.points[v, u, 2] - z
+        if qx * qx + qy * qy + qz * qz > gate * gate:
+            continue
+        m = image.normals[v, u]
+        if not (m[0] * nx + m[1] * ny + m[2] * nz > 0.5):
+            continue
+        residual = qx * nx + qy * ny + qz * nz
+        J = (ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx, nx, ny, nz)
+        for i in range(6):
+            g[i] += J[i] * residual
+            for j in range(i, 6):
+                A[i, j] += J[i] * J[j]
+        pairs += 1
+    return pairs
 
 
 @compiled
