@@ -11,6 +11,10 @@ from active6d_core.registry import AUTOMATIC
 from active6d_core.rgbd import crop_depth, make_view
 from active6d_perception.estimators.registry import create_estimator
 
+# Pixels that an object spans at least, and images that it spans at most, to be worth looking for.
+_SMALLEST = 6
+_LARGEST = 4
+
 
 class Active6D:
     """Finds every instance of one object in an RGB-D image.
@@ -77,8 +81,3 @@ class Active6D:
                 f"at {distance:.3g} m, {self.model.name} ({1e3 * self.model.diameter:.0f} mm) would span {pixels:.0f} "
                 f"pixels of {camera.width}; check depth_scale, K and the unit of the mesh"
             )
-
-
-# Pixels that an object spans at least, and images that it spans at most, to be worth looking for.
-_SMALLEST = 6
-_LARGEST = 4

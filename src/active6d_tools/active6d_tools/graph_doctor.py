@@ -5,7 +5,6 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import partial
-from importlib import import_module
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -74,14 +73,12 @@ class _Listener(Node):
             if topic.name in self._subscribed or not offered:
                 continue
             self._subscribed.add(topic.name)
-            package, _, name = topic.type.split("/")
             qos = QoSProfile(
                 depth=1,
                 reliability=min((each.reliability for each in offered), key=_RELIABILITIES.index),
                 durability=min((each.durability for each in offered), key=_DURABILITIES.index),
             )
-            message_type = getattr(import_module(f"{package}.msg"), name)
-            self.create_subscription(message_type, topic.name, partial(self._count, topic.name), qos, raw=True)
+            self.create_subscription(topic.message_type, topic.name, partial(self._count, topic.name), qos, raw=True)
 
     def publishers(self, topic: str) -> list[Any]:
         """Endpoints that publish a topic, this node left out."""

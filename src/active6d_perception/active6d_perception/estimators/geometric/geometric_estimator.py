@@ -31,6 +31,8 @@ _SCALES = (0.35, 1.5)
 _VIOLATION = 1.5
 # Starts kept at each measured point.
 _STARTS_PER_POINT = 24
+# A start that fits less than this, net of violations, is dropped.
+_LEAST_VALUE = 0.05
 # Logistic regression of whether a pose is right, on the features of :meth:`GeometricEstimator.candidates`, fitted by
 # active6d_tools.studies.fit_geometric_score on validation views.
 _SCORE_WEIGHTS = np.array([2.56, -0.36, 4.60, 1.36, -0.28])
@@ -99,7 +101,7 @@ class GeometricEstimator:
             of its pixels over the diameter squared, and that area over the silhouette's part that is not occluded.
         """
         image = image_of(surface)
-        poses = self._propose(surface)
+        poses = self._propose(surface, image)
         if len(poses):
             poses = refine_projectively(poses, self._samples[64], image, self._scale * np.array([0.02, 0.012]), 4)
             poses = self._thin_out(poses, self._weigh(poses, image, 64, 0.008, 0.6), 0.06, self.parameters.refined, 15)
@@ -129,7 +131,7 @@ class GeometricEstimator:
         )
         return poses, relabel[label], features
 
-    def _propose(self, surface: Surface) -> np.ndarray:
+    def _propose(self, surface: Surface, image: MeasuredImage) -> np.ndarray:
         """(k, 4, 4) starting poses that the depth image does not contradict."""
         usable = surface.foreground & np.isfinite(surface.normals).all(axis=-1)
         index = _one_a_cube(surface, usable, 0.05 * self.model.diameter)
@@ -141,12 +143,12 @@ class GeometricEstimator:
         references = np.linspace(0, len(points) - 1, count).astype(np.intp)
         voted, _ = self._voting.candidates(points, normals, references, peaks=3)
         starts = self._starts.at(points[references], normals[references])
-        image = image_of(surface)
         value = _value(self._weigh(starts.reshape(-1, 4, 4), image, 32, 0.010, 0.5)).reshape(starts.shape[:2])
         best = np.argsort(-value, axis=1, kind="stable")[:, :_STARTS_PER_POINT]
         near = np.take_along_axis(starts, best[..., None, None], axis=1).reshape(-1, 4, 4)
-        poses = np.concatenate([near, voted])
-        return poses[_value(self._weigh(poses, image, 32, 0.010, 0.5)) > 0.05]
+        kept = np.take_along_axis(value, best, axis=1).ravel() > _LEAST_VALUE
+        voted = voted[_value(self._weigh(voted, image, 32, 0.010, 0.5)) > _LEAST_VALUE]
+        return np.concatenate([near[kept], voted])
 
     def _silhouette_area(self, poses: np.ndarray) -> np.ndarray:
         """(k,) area of the model's silhouette at its distance, without occlusion, square metres."""
