@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
-from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View, backproject, normals_from_points, pixel_rays
+from active6d_core.camera import (
+    DEFAULT_CAMERA,
+    PinholeCamera,
+    View,
+    backproject,
+    normals_from_points,
+    pixel_rays,
+    pool_depth,
+)
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, rotation_angle, transform_points
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
@@ -30,7 +38,6 @@ from active6d_perception.estimators.dense.network_input import (
     network_input,
     output_camera,
     pad,
-    pool_depth,
     ray_rotation,
     reduce_view,
 )

@@ -7,6 +7,7 @@ import numpy as np
 
 # Focal lengths over the longer side of the image: from fields of view of 136 degrees to those of 3 degrees.
 _FOCAL_LENGTHS = (0.2, 20.0)
+_SAME_SURFACE = 0.02  # relative difference of depth
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,11 @@ class PinholeCamera:
             (self.cy + 0.5) * factor - 0.5,
         )
 
+    def reduced(self, factor: int) -> "PinholeCamera":
+        """The camera of an image whose blocks of ``factor`` x ``factor`` pixels became one; sides are cut."""
+        exact = self.scaled(1 / factor)
+        return PinholeCamera(self.width // factor, self.height // factor, exact.fx, exact.fy, exact.cx, exact.cy)
+
 
 #: The simulator's default: VGA with 60 degrees across, an Intel D415-like field of view.
 DEFAULT_CAMERA = PinholeCamera.from_field_of_view(640, 480, 60.0)
@@ -148,3 +154,33 @@ def normals_from_points(points: np.ndarray, reach: int = 2) -> np.ndarray:
     inner[facing] *= -1
     normals[reach:-reach, reach:-reach] = inner
     return normals
+
+
+def pool_depth(depth: np.ndarray, factor: int) -> np.ndarray:
+    """Reduce a depth image: each block becomes the mean of its nearest surface, never a mean of two surfaces.
+
+    Args:
+        depth: (H, W) metres, NaN where invalid.
+        factor: side of a block in pixels; pixels that it does not divide are cut at the right and bottom.
+
+    Returns:
+        (H // factor, W // factor) float32, NaN for a block without a valid pixel.
+    """
+    if factor == 1:
+        return depth.astype(np.float32)
+    height, width = (size // factor for size in depth.shape)
+    layers = [
+        depth[row : height * factor : factor, column : width * factor : factor]
+        for row in range(factor)
+        for column in range(factor)
+    ]
+    nearest = layers[0]
+    for layer in layers[1:]:
+        nearest = np.fmin(nearest, layer)
+    limit = nearest * np.float32(1 + _SAME_SURFACE)
+    total, count = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    for layer in layers:
+        near = layer <= limit
+        np.add(total, layer, out=total, where=near)
+        count += near
+    return np.divide(total, count, out=np.full((height, width), np.nan, np.float32), where=count > 0)

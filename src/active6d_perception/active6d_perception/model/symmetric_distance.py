@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from active6d_core.object_model import ObjectModel
+from active6d_core.object_model import ObjectModel, Symmetry
 
 # Metres. Distances are rounded to this, so that they do not depend on the order of summation.
 _RESOLUTION = 1e-7
@@ -20,12 +20,20 @@ class SymmetricDistance:
     """
 
     def __init__(self, model: ObjectModel) -> None:
-        points = model.surface[0]
-        self._group = model.symmetry.discrete
-        self._axis = model.symmetry.axis
+        self._measure(model.surface[0], model.symmetry)
+
+    @classmethod
+    def of_points(cls, points: np.ndarray, symmetry: Symmetry) -> "SymmetricDistance":
+        """The distance of (n, 3) points, metres, that spread over a surface with a symmetry about their origin."""
+        made = cls.__new__(cls)
+        made._measure(points, symmetry)
+        return made
+
+    def _measure(self, points: np.ndarray, symmetry: Symmetry) -> None:
+        self._group, self._axis = symmetry.discrete, symmetry.axis
         mean, moment = points.mean(axis=0), points.T @ points / len(points)
         # The samples are not exactly symmetric, so their moments are averaged over the symmetry group.
-        rotations = model.symmetry.rotations(step_degrees=10.0)
+        rotations = symmetry.rotations(step_degrees=10.0)
         self._mean = (rotations @ mean).mean(axis=0)
         self._moment = (rotations @ moment @ np.swapaxes(rotations, 1, 2)).mean(axis=0)
 

@@ -17,12 +17,13 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from active6d_core.camera import pool_depth
 from active6d_core.metrics import e_add
 from active6d_core.se3 import make_transform
 from active6d_perception.estimators.dense.decoding import decode
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
-from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera, pool_depth
+from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera
 from active6d_perception.estimators.refinement import refine
 from active6d_perception.model.model_views import model_views
 from active6d_tools.studies.arguments import read_arguments

@@ -13,13 +13,14 @@ import numpy as np
 from rich.progress import track
 from scipy.special import softmax
 
+from active6d_core.camera import pool_depth
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
 from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, rotation_about_z
 from active6d_perception.estimators.dense.decoding import axis_rotation_probability, decode
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
-from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera, pool_depth
+from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera
 from active6d_perception.estimators.refinement import refine
 from active6d_perception.model.model_views import model_views
 from active6d_tools.studies.arguments import read_arguments

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.special import expit, softmax
 
-from active6d_core.camera import View
+from active6d_core.camera import View, pool_depth
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
@@ -27,7 +27,6 @@ from active6d_perception.estimators.dense.network_input import (
     network_input,
     output_camera,
     pad,
-    pool_depth,
     reduce_view,
     reduction,
 )

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from active6d_core.camera import PinholeCamera, View, backproject, normals_from_points, pixel_rays
+from active6d_core.camera import PinholeCamera, View, backproject, normals_from_points, pixel_rays, pool_depth
 
 #: Width in pixels that views are reduced to, by an integer factor.
 INPUT_WIDTH = 320
@@ -24,7 +24,6 @@ OUTPUT_STRIDE = 2
 
 _WINDOWS = (13, 61)  # pixels: a detail of an object, and more than an object
 _MOMENT_WINDOW = 17  # pixels: half of an object
-_SAME_SURFACE = 0.02  # relative difference of depth
 
 
 def reduction(camera: PinholeCamera) -> int:
@@ -35,11 +34,8 @@ def reduction(camera: PinholeCamera) -> int:
 def reduce_view(view: View) -> View:
     """Reduce a view to the network's resolution; pixels that the factor does not divide are cut at right and bottom."""
     factor = reduction(view.camera)
-    height, width = (size // factor for size in view.depth.shape)
     color = _pool_color(view.color, factor)
-    exact = view.camera.scaled(1 / factor)
-    camera = PinholeCamera(width, height, exact.fx, exact.fy, exact.cx, exact.cy)
-    return replace(view, color=color, depth=pool_depth(view.depth, factor), camera=camera)
+    return replace(view, color=color, depth=pool_depth(view.depth, factor), camera=view.camera.reduced(factor))
 
 
 def _pool_color(color: np.ndarray, factor: int) -> np.ndarray:
@@ -50,36 +46,6 @@ def _pool_color(color: np.ndarray, factor: int) -> np.ndarray:
         for column in range(factor):
             total += color[row:height:factor, column:width:factor]
     return (total // (factor * factor)).astype(np.uint8)
-
-
-def pool_depth(depth: np.ndarray, factor: int) -> np.ndarray:
-    """Reduce a depth image: each block becomes the mean of its nearest surface, never a mean of two surfaces.
-
-    Args:
-        depth: (H, W) metres, NaN where invalid.
-        factor: side of a block in pixels; pixels that it does not divide are cut at the right and bottom.
-
-    Returns:
-        (H // factor, W // factor) float32, NaN for a block without a valid pixel.
-    """
-    if factor == 1:
-        return depth.astype(np.float32)
-    height, width = (size // factor for size in depth.shape)
-    layers = [
-        depth[row : height * factor : factor, column : width * factor : factor]
-        for row in range(factor)
-        for column in range(factor)
-    ]
-    nearest = layers[0]
-    for layer in layers[1:]:
-        nearest = np.fmin(nearest, layer)
-    limit = nearest * np.float32(1 + _SAME_SURFACE)
-    total, count = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
-    for layer in layers:
-        near = layer <= limit
-        np.add(total, layer, out=total, where=near)
-        count += near
-    return np.divide(total, count, out=np.full((height, width), np.nan, np.float32), where=count > 0)
 
 
 def network_input(view: View, diameter: float) -> np.ndarray:
@@ -122,9 +88,7 @@ def pad(tensor: np.ndarray) -> np.ndarray:
 
 def output_camera(input_camera: PinholeCamera) -> PinholeCamera:
     """Intrinsics of the network's output, from those of its input; sides that the stride does not divide are cut."""
-    exact = input_camera.scaled(1 / OUTPUT_STRIDE)
-    width, height = input_camera.width // OUTPUT_STRIDE, input_camera.height // OUTPUT_STRIDE
-    return PinholeCamera(width, height, exact.fx, exact.fy, exact.cx, exact.cy)
+    return input_camera.reduced(OUTPUT_STRIDE)
 
 
 @lru_cache(maxsize=8)
