@@ -7,6 +7,7 @@ import pytest
 import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
 from ros_harness import GraphHarness
 from sensor_msgs.msg import PointCloud2
 from synthetic_bank import synthetic_bank
@@ -85,6 +86,12 @@ class Episode:
 @pytest.fixture
 def episode(graph, make_objects):
     return lambda **overrides: Episode(graph, make_objects, **{"policy": "lowest-score", "steps": 2, **overrides})
+
+
+def test_a_parameter_of_a_configured_node_is_refused(episode):
+    (result,) = episode().node.set_parameters([Parameter("steps", value=3)])
+    assert not result.successful
+    assert "'steps' can be set only while the node is unconfigured" in result.reason
 
 
 def test_an_episode_of_two_moves(episode):

@@ -69,6 +69,6 @@ def test_without_the_packages_nothing_is_published(graph, models):
     node = graph.add(GraphNode("plain", context=graph.context))
     before = {name for name, _ in node.get_topic_names_and_types()}
     TransformOutput(node).publish({"camera": np.eye(4)}, 1, "world")
-    DetectionOutput(node, "objects/detections").publish(SceneObjects.empty(), models["wedge"], 1, "world")
+    DetectionOutput(node).publish(SceneObjects.empty(), models["wedge"], 1, "world")
     installed = {name for name, _ in node.get_topic_names_and_types()} - before
     assert installed <= {"/tf", "/objects/detections"}

@@ -1,11 +1,10 @@
 """Node ``attention_policy``: subscribes to the fused objects, publishes attention and the next view."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 
 from active6d_agent.policies.episode_state import EpisodeState, Limits
@@ -17,11 +16,10 @@ from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
     OutdatedError,
     attention_to_cloud,
-    make_header,
     objects_from_cloud,
     points_from_cloud,
     stamp_to_ns,
-    transform_to_pose,
+    transform_to_pose_stamped,
 )
 from active6d_core.ros.episode_messages import EpisodeEnd, GoalState, GoalStatus
 from active6d_core.ros.heartbeat import Awaited
@@ -44,8 +42,8 @@ class AttentionPolicyNode(GraphNode):
     messages again.
     """
 
-    def __init__(self, **node_arguments) -> None:
-        super().__init__("attention_policy", **node_arguments)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("attention_policy", **options)
         self.declare("object", "mug", "name of the object that fills the bin")
         self.declare(
             "policy",
@@ -77,18 +75,12 @@ class AttentionPolicyNode(GraphNode):
 
     def setup(self) -> None:
         """Load the object and the policy."""
-        try:
-            parameters = yaml.safe_load(self.value("policy_parameters"))
-        except yaml.YAMLError:
-            parameters = None
-        if not isinstance(parameters, dict):
-            raise ValueError(f"{self.get_name()}: parameter 'policy_parameters' must be a YAML mapping")
         timeout = self.value("goal_timeout")
-        self._limits = Limits(*self._read_views(), self.value("steps"), self.value("metres"), timeout)
+        self._budget = Limits(*self._read_views(), self.value("steps"), self.value("metres"), timeout)
         name, policy = self.value("object"), self.value("policy")
         model = load_object(name)
         self.policy_name = choose_policy(name) if policy == AUTOMATIC else policy
-        self.policy = create_policy(self.policy_name, model, **parameters)
+        self.policy = create_policy(self.policy_name, model, **self.mapping("policy_parameters"))
         if timeout > 0:
             # Ticks, not a deadline: time in which this process could not listen does not count.
             tick = timeout / _TICKS_PER_TIMEOUT
@@ -104,7 +96,7 @@ class AttentionPolicyNode(GraphNode):
     def _forget(self) -> None:
         self._episode: EpisodeState | None = None
         self._latest: tuple[int, SceneObjects, np.ndarray] | None = None
-        self._published: list = []
+        self._published: list[tuple[Any, Any]] = []
         self._views.reset()
 
     def awaited(self) -> Awaited | None:
@@ -153,15 +145,16 @@ class AttentionPolicyNode(GraphNode):
             return
         # The first view may have overtaken the announcement of its episode.
         views = {} if self._episode is None else self._episode.views_since(start)
-        self._begin_episode(start)
+        episode = self._begin_episode(start)
         for stamp, position in views.items():
-            self._episode.add_view(stamp, position)
+            episode.add_view(stamp, position)
         if self._latest is not None and self._latest[0] >= start:
-            self._decide()
+            self._decide(episode, *self._latest)
 
-    def _begin_episode(self, start: int) -> None:
-        self._episode = EpisodeState(start, self._limits)
+    def _begin_episode(self, start: int) -> EpisodeState:
+        self._episode = episode = EpisodeState(start, self._budget)
         self.policy.reset(np.random.default_rng([self.value("seed"), start]))
+        return episode
 
     def _on_objects(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
@@ -181,60 +174,59 @@ class AttentionPolicyNode(GraphNode):
     def _is_latest(self, stamp: int) -> bool:
         return self._latest is not None and stamp == self._latest[0]
 
-    def _on_view(self, stamp: int, view: dict) -> None:
-        if self._episode is None:
-            self._begin_episode(stamp)
-        if stamp < self._episode.start:
+    def _on_view(self, stamp: int, view: dict[str, Any]) -> None:
+        episode = self._episode or self._begin_episode(stamp)
+        if stamp < episode.start:
             raise OutdatedError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
         self._latest = (stamp, view["objects"], view["unexplained"])
-        self._episode.add_view(stamp, view["pose"][:3, 3])
+        episode.add_view(stamp, view["pose"][:3, 3])
         self._published = []
-        if not self._episode.ended:
+        if not episode.ended:
             with self.measure(stamp) as summary:
-                self._decide()
-                summary.append(f"{len(view['objects'])} objects, {len(self._episode.positions)} views so far")
+                self._decide(episode, *self._latest)
+                summary.append(f"{len(view['objects'])} objects, {len(episode.positions)} views so far")
 
     def _on_status(self, message: DiagnosticArray) -> None:
         status = GoalStatus.from_message(message, self.world_frame)
-        if not self._is_latest(status.stamp):
+        episode, latest = self._episode, self._latest
+        if episode is None or latest is None or status.stamp != latest[0]:
             return
         if status.state == GoalState.REACHED:
-            self._episode.reached()
-        elif status.state == GoalState.REFUSED and self._episode.refused(status.reason):
+            episode.reached()
+        elif status.state == GoalState.REFUSED and episode.refused(status.reason):
             self.get_logger().info(f"the camera refuses the goal, another view is chosen: {status.reason}")
-            self._decide()
+            self._decide(episode, *latest)
 
     def _on_tick(self, seconds: float) -> None:
-        if self._latest is None or not self._active:
+        episode, latest = self._episode, self._latest
+        if episode is None or latest is None or not self._active:
             return
-        if self._views.newest > self._latest[0]:  # of a camera that does not answer goals
-            self._episode.reached()
-        if self._episode.wait(seconds):
+        if self._views.newest > latest[0]:  # of a camera that does not answer goals
+            episode.reached()
+        if episode.wait(seconds):
             timeout = self.value("goal_timeout")
             self.get_logger().warning(f"the camera did not reach the goal within {timeout:g} s, another view is chosen")
-            self._decide()
+            self._decide(episode, *latest)
 
-    def _decide(self) -> None:
-        stamp, objects, unexplained = self._latest
+    def _decide(self, episode: EpisodeState, stamp: int, objects: SceneObjects, unexplained: np.ndarray) -> None:
         self._published = []
-        decision, end = self._episode.decide(self.policy, objects, unexplained)
+        decision, end = episode.decide(self.policy, objects, unexplained)
         if decision is not None:
             self._publish_attention(stamp, objects, decision)
-        if end:
-            self._finish(stamp, end)
+        if decision is None or end:
+            self._finish(episode, stamp, end)
             return
-        goal = PoseStamped(header=make_header(stamp, self.world_frame))
-        goal.pose = transform_to_pose(self._limits.sphere.pose(decision.position))
-        self._publish(self.goal, goal)
+        T_world_goal = self._budget.sphere.pose(decision.position)
+        self._publish(self.goal, transform_to_pose_stamped(T_world_goal, stamp, self.world_frame))
 
     def _publish_attention(self, stamp: int, objects: SceneObjects, decision: Decision) -> None:
         centres = objects.T_world_object[:, :3, 3]
         cloud = attention_to_cloud(centres, decision.attention, decision.attended, stamp, self.world_frame)
         self._publish(self.attention, cloud)
 
-    def _finish(self, stamp: int, reason: str) -> None:
-        self._episode.ended = True
-        moves, travelled = self._episode.moves, self._episode.travelled
+    def _finish(self, episode: EpisodeState, stamp: int, reason: str) -> None:
+        episode.ended = True
+        moves, travelled = episode.moves, episode.travelled
         values = {
             "policy": self.policy_name,
             "seed": str(self.value("seed")),
@@ -244,7 +236,7 @@ class AttentionPolicyNode(GraphNode):
         self._publish(self.end, EpisodeEnd(stamp, self.world_frame, reason, values).to_message())
         self.get_logger().info(f"episode ended after {moves} moves and {travelled:.2f} m: {reason}")
 
-    def _publish(self, publisher, message) -> None:
+    def _publish(self, publisher: Any, message: Any) -> None:
         publisher.publish(message)
         self._published.append((publisher, message))
 

@@ -174,11 +174,11 @@ def describe(
 def compare(stamp: int, topic: str, recorded: bytes | None, live: bytes) -> Comparison:
     """Compare the serialized messages of one view and topic."""
     message_type = COMPARED[topic].type
-    found = TYPESTORE.deserialize_cdr(live, message_type)
+    found: Any = TYPESTORE.deserialize_cdr(live, message_type)
     size = found.width * found.height
     if recorded is None:
         return Comparison(stamp, topic, None, size, False, {})
-    expected = TYPESTORE.deserialize_cdr(recorded, message_type)
+    expected: Any = TYPESTORE.deserialize_cdr(recorded, message_type)
     equal = TYPESTORE.serialize_cdr(found, message_type) == TYPESTORE.serialize_cdr(expected, message_type)
     differences = {} if equal else _differences(expected, found)
     return Comparison(stamp, topic, expected.width * expected.height, size, equal, differences)
@@ -194,7 +194,8 @@ def _differences(expected: Any, found: Any) -> dict[str, float]:
     if tables[0].dtype != tables[1].dtype:
         return {"columns": float("nan")}
     largest = {
-        name: np.abs(tables[0][name].astype(float) - tables[1][name]).max(initial=0.0) for name in tables[0].dtype.names
+        name: np.abs(tables[0][name].astype(float) - tables[1][name]).max(initial=0.0)
+        for name in tables[0].dtype.fields or ()
     }
     return {name: float(difference) for name, difference in largest.items() if difference != 0}
 

@@ -181,16 +181,21 @@ def run_episode(
 
 def describe(settings: EpisodeSettings) -> GraphDescription:
     """The graph of an episode, each node with its parameters."""
-    camera = {"object": settings.object, "seed": settings.seed}
+    camera: dict[str, Any] = {"object": settings.object, "seed": settings.seed}
     if settings.scene is not None:
         camera["scene"] = settings.scene
-    policy = {"object": settings.object, "seed": settings.seed, "policy": settings.policy, "steps": settings.steps}
+    policy: dict[str, Any] = {
+        "object": settings.object,
+        "seed": settings.seed,
+        "policy": settings.policy,
+        "steps": settings.steps,
+    }
     if settings.metres is not None:
         policy["metres"] = float(settings.metres)
     estimator = {"object": settings.object}
     if settings.estimator is not None:
         estimator["estimator"] = settings.estimator
-    nodes = {
+    nodes: dict[str, dict[str, Any]] = {
         "camera_simulator": camera,
         "pose_estimator": estimator,
         "hypothesis_fusion": {"object": settings.object},

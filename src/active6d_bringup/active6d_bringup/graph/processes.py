@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -56,7 +57,7 @@ class ProcessGraph:
         self.restarted: list[str] = []
         self._started = False
         self._complete = self._node.create_client(Trigger, "episode_recorder/complete")
-        self._recorded = None
+        self._recorded: Any = None
 
     def add(self, node: Node) -> None:
         """Spin one more node of the caller's in this process."""

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
@@ -23,8 +24,8 @@ class BagPlayerNode(GraphNode):
     has passed as in the recording, divided by ``rate``.
     """
 
-    def __init__(self, **arguments) -> None:
-        super().__init__("bag_player", **arguments)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("bag_player", **options)
         self.declare("bag", "", "folder of the bag to play")
         self.declare(
             "rate",

@@ -3,6 +3,7 @@
 import signal
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -21,15 +22,15 @@ class EpisodeRecorderNode(GraphNode):
     written before the bag is closed.
     """
 
-    def __init__(self, **arguments) -> None:
-        super().__init__("episode_recorder", **arguments)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("episode_recorder", **options)
         self.declare("bag", "", "folder to create for the bag")
         self.declare(
             "latched_camera", True, "camera topics are transient local; false for plain camera drivers", fixed=True
         )
         self.declare("settings", "{}", "parameters of the other nodes as JSON, kept in metadata.yaml for replay")
         self._writer: EpisodeWriter | None = None
-        self._subscriptions_by_topic = {topic.name: self._subscribe(topic) for topic in CONTRACT}
+        self._subscriptions_by_topic = {topic.name: self._listen(topic) for topic in CONTRACT}
         self.create_service(Trigger, "~/complete", self._answer_complete)
 
     def setup(self) -> None:
@@ -68,9 +69,9 @@ class EpisodeRecorderNode(GraphNode):
 
     def missing(self, stamp: int) -> list[str]:
         """Topics that the recording of an episode ending at the view with this stamp (ns) still waits for."""
-        return self._writer.missing(stamp)
+        return self._writer.missing(stamp) if self._writer is not None else []
 
-    def _subscribe(self, topic: Topic) -> Subscription:
+    def _listen(self, topic: Topic) -> Subscription:
         from_driver = topic.from_camera and not self.value("latched_camera")
         latched = topic.transient_local and not from_driver
         qos = QoSProfile(

@@ -5,8 +5,8 @@ Everything that comes in is checked here (sizes, encodings, frames, numbers, qua
 message objects that rosbags deserialises.
 """
 
-import array
 import re
+from array import array
 from copy import copy
 from typing import Any
 
@@ -224,11 +224,11 @@ def _array_to_image(pixels: np.ndarray, encoding: str, stamp: int, frame: str) -
     return image
 
 
-def _bytes_of(values: np.ndarray) -> array.array:
+def _bytes_of(values: np.ndarray) -> "array[int]":
     """The array's bytes in the one container that a message's setter takes without looking at every byte."""
-    data = array.array("B")
+    data = array("B")
     if values.size:
-        data.frombytes(memoryview(np.ascontiguousarray(values)).cast("B"))
+        data.frombytes(np.ascontiguousarray(values).data.cast("B"))
     return data
 
 
@@ -375,8 +375,8 @@ def _layout(columns: dict[str, str]) -> np.dtype:
 
 def _table_to_cloud(table: np.ndarray, stamp: int, frame: str) -> PointCloud2:
     fields = [
-        PointField(name=name, offset=table.dtype.fields[name][1], datatype=_DATATYPES[table.dtype[name].str], count=1)
-        for name in table.dtype.names
+        PointField(name=name, offset=offset, datatype=_DATATYPES[dtype.str], count=1)
+        for name, (dtype, offset, *_) in (table.dtype.fields or {}).items()
     ]
     cloud = PointCloud2(header=make_header(stamp, frame), height=1, width=len(table), fields=fields)
     cloud.point_step = table.dtype.itemsize
@@ -400,7 +400,7 @@ def _cloud_to_table(message: PointCloud2, columns: dict[str, str], frame: str, m
         )
     table = read_table(message)
     for name, dtype in columns.items():
-        if name not in table.dtype.names or table.dtype[name].str != dtype:
+        if name not in (table.dtype.fields or {}) or table.dtype[name].str != dtype:
             raise MessageError(f"table has no usable column '{name}' of type {dtype}")
     return table
 
@@ -417,14 +417,15 @@ def read_table(message: Any) -> np.ndarray:
         and field.count == 1
         and field.offset + np.dtype(_DTYPES[field.datatype]).itemsize <= message.point_step
     ]
-    layout = {
-        "names": [field.name for field in usable],
-        "formats": [_DTYPES[field.datatype] for field in usable],
-        "offsets": [field.offset for field in usable],
-    }
-    if message.width * message.height == 0:
-        return np.zeros(0, np.dtype(layout))
-    return np.frombuffer(message.data, np.dtype({**layout, "itemsize": message.point_step}))
+    layout = np.dtype(
+        {
+            "names": [field.name for field in usable],
+            "formats": [_DTYPES[field.datatype] for field in usable],
+            "offsets": [field.offset for field in usable],
+            "itemsize": message.point_step,
+        }
+    )
+    return np.frombuffer(message.data, layout) if message.width * message.height else np.zeros(0, layout)
 
 
 def _fill_poses(table: np.ndarray, T: np.ndarray) -> None:

@@ -53,7 +53,7 @@ class GraphNode(ParameterNode):
         super().__init__(name, context=context, namespace=namespace, overrides=overrides)
         self._active = False
         self._starting = False
-        self._held: list[tuple[Callable[[Any], None], deque]] = []
+        self._held: list[tuple[Callable[[Any], None], deque[Any]]] = []
         self._failure: Exception | None = None
         self._views_measured = 0
         self._rejected = 0
@@ -116,7 +116,7 @@ class GraphNode(ParameterNode):
         self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
     ) -> Subscription:
         latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        held = deque(maxlen=qos.depth if latched else 0)
+        held: deque[Any] = deque(maxlen=qos.depth if latched else 0)
 
         def guarded(message: Any) -> None:
             if not self._active:

@@ -4,7 +4,7 @@ Without them nothing else is missing: the graph itself needs neither.
 """
 
 from importlib import import_module
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance, Quaternion, Transform, TransformStamped, Vector3
@@ -16,7 +16,7 @@ from active6d_core.ros.node import GraphNode
 from active6d_core.ros.topics import DETECTIONS, TRANSFORMS
 
 
-def import_optional(package: str) -> ModuleType | None:
+def import_optional(package: str) -> Any:
     """The ``msg`` module of a message package, None where it is not installed."""
     try:
         return import_module(f"{package}.msg")
@@ -40,7 +40,7 @@ class TransformOutput:
 class DetectionOutput:
     """Publishes accumulated objects as a Detection3DArray where vision_msgs is installed, else does nothing."""
 
-    def __init__(self, node: GraphNode, topic: str) -> None:
+    def __init__(self, node: GraphNode) -> None:
         self._messages = import_optional("vision_msgs")
         self._publisher = node.output(DETECTIONS) if self._messages else None
 
@@ -50,7 +50,7 @@ class DetectionOutput:
             self._publisher.publish(detections_message(self._messages, objects, model, stamp, frame))
 
 
-def transforms_message(messages: ModuleType, T_parent_children: dict[str, np.ndarray], stamp: int, parent: str):
+def transforms_message(messages: Any, T_parent_children: dict[str, np.ndarray], stamp: int, parent: str) -> Any:
     """A ``messages.TFMessage`` with one transform per child frame."""
     transforms = []
     for child, T in T_parent_children.items():
@@ -63,7 +63,7 @@ def transforms_message(messages: ModuleType, T_parent_children: dict[str, np.nda
     return messages.TFMessage(transforms=transforms)
 
 
-def detections_message(messages: ModuleType, objects: SceneObjects, model: ObjectModel, stamp: int, frame: str):
+def detections_message(messages: Any, objects: SceneObjects, model: ObjectModel, stamp: int, frame: str) -> Any:
     """A ``messages.Detection3DArray`` of vision_msgs 4: one detection with one hypothesis and a box per object.
 
     The box is the mesh's, in the object's own axes; its centre is the box's, which need not be the object's origin.

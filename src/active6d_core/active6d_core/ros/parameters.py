@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.context import Context
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -50,8 +51,8 @@ class ParameterLimits:
         if self.minimum is None and self.maximum is None:
             return descriptor
         if isinstance(default, int):
-            low = -_LARGEST_INTEGER if self.minimum is None else int(self.minimum)
-            high = _LARGEST_INTEGER if self.maximum is None else int(self.maximum)
+            low: float = -_LARGEST_INTEGER if self.minimum is None else int(self.minimum)
+            high: float = _LARGEST_INTEGER if self.maximum is None else int(self.maximum)
             descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
         else:
             low = -sys.float_info.max if self.minimum is None else float(self.minimum)
@@ -87,7 +88,7 @@ class ParameterNode(LifecycleNode):
         parameters = [Parameter(key, value=value) for key, value in (overrides or {}).items()]
         super().__init__(name, context=context, namespace=namespace, parameter_overrides=parameters)
         self._configured = False
-        self._limits: dict[str, ParameterLimits] = {}
+        self._parameter_limits: dict[str, ParameterLimits] = {}
         self.add_on_set_parameters_callback(self._check_set)
 
     def declare(
@@ -113,16 +114,30 @@ class ParameterNode(LifecycleNode):
         descriptor = limits.descriptor(default, description, fixed)
         descriptor.type = self.get_parameter(name).type_.value
         self.set_descriptor(name, descriptor)
-        self._limits[name] = limits
+        self._parameter_limits[name] = limits
 
     def value(self, name: str) -> Any:
         """The value of a declared parameter; arrays are lists."""
         value = self.get_parameter(name).value
         return value.tolist() if hasattr(value, "tolist") else value
 
+    def mapping(self, name: str) -> dict[str, Any]:
+        """The value of a text parameter that holds a YAML mapping.
+
+        Raises:
+            ValueError: it holds something else; the message names the parameter.
+        """
+        try:
+            value = yaml.safe_load(self.value(name))
+        except yaml.YAMLError:
+            value = None
+        if not isinstance(value, dict):
+            raise ValueError(f"{self.get_name()}: parameter '{name}' must be a YAML mapping")
+        return value
+
     def _check_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         for parameter in parameters:
-            limits = self._limits.get(parameter.name)
+            limits = self._parameter_limits.get(parameter.name)
             if limits is None:
                 continue
             if self._configured:

@@ -2,7 +2,7 @@
 
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import rclpy
@@ -14,7 +14,7 @@ from active6d_core.ros.node import GraphNode
 _WAKE_SECONDS = 1.0
 
 
-def run_node(node_type: type[GraphNode], args: Sequence[str] | None = None) -> None:
+def run_node(node_type: Callable[[], GraphNode], args: Sequence[str] | None = None) -> None:
     """Spin one node until interrupted. Exit code 2 on bad arguments."""
     _refuse_words(list(sys.argv if args is None else args))
     rclpy.init(args=args)

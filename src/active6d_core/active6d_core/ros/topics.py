@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 from importlib import import_module
+from typing import Any
 
 
 class Per(Enum):
@@ -44,7 +45,7 @@ class Topic:
     depth: int = 10
 
     @property
-    def message_type(self) -> type:
+    def message_type(self) -> Any:
         """The message class; needs the ROS package of the message.
 
         Raises:

@@ -57,7 +57,7 @@ class HypothesisFusionNode(GraphNode):
         self._poses = self.output(topics.OBJECTS_POSES)
         self._markers = self.output(topics.OBJECTS_MARKERS)
         self._unexplained = self.output(topics.UNEXPLAINED)
-        self._detections = DetectionOutput(self, "objects/detections")
+        self._detections = DetectionOutput(self)
         # First, for the executor calls back in this order: a new episode is known before its first view.
         self.input(topics.EPISODE_START, self._on_episode_start)
         self.input(topics.HYPOTHESES, self._on_hypotheses)
@@ -126,19 +126,18 @@ class HypothesisFusionNode(GraphNode):
         self._verifier = Verifier(self._model, self.value("epsilon"), self.value("samples"))
         self._fusion = SceneFusion(self._model, parameters)
         self._surface = ObservedSurface(self._model, self._make_grid(), parameters.explained_within)
+        self._mesh_uri = ""
         try:
             self._mesh_uri = export_mesh(self._model)
         except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
-            self._mesh_uri = None
             self.get_logger().warning(f"objects/markers stays empty, the mesh cannot be written for viewers: {error}")
 
     def _make_grid(self) -> SurfaceGrid:
         usual = SurfaceGrid.for_model(self._model)
-        sides = zip(self.value("workspace_width"), usual.width, strict=False)
-        given = {name: self.value(f"workspace_{name}") for name in ("floor", "height")}
-        given = {name: value for name, value in given.items() if value != 0}
+        sides, floor, height = (self.value(f"workspace_{name}") for name in ("width", "floor", "height"))
+        width: Any = tuple(side or own for side, own in zip(sides, usual.width, strict=False))  # the grid checks it
         try:
-            return replace(usual, width=tuple(side or own for side, own in sides), **given)
+            return replace(usual, width=width, floor=floor or usual.floor, height=height or usual.height)
         except ValueError as error:
             raise ValueError(f"{self.get_name()}: parameters 'workspace_*': {error}") from error
 
@@ -148,15 +147,15 @@ class HypothesisFusionNode(GraphNode):
 
     def _on_hypotheses(self, message: PointCloud2) -> None:
         stamp = stamp_to_ns(message.header.stamp)
-        if self._is_latest(stamp):
-            self._publish()  # a restarted estimator repeats its last view: repeat the result for its subscribers
+        if self._latest is not None and stamp == self._latest[0]:
+            self._publish(*self._latest)  # a restarted estimator repeats its last view: repeat the result
         else:
             self._inputs.add("hypotheses", stamp, message)
 
     def _on_segmentation(self, message: Image) -> None:
         require_frame(message.header, self.camera_frame)
         stamp = stamp_to_ns(message.header.stamp)
-        if not self._is_latest(stamp):
+        if self._latest is None or stamp != self._latest[0]:
             self._inputs.add("segmentation", stamp, image_to_segmentation(message))
 
     def _on_episode_start(self, message: DiagnosticArray) -> None:
@@ -164,7 +163,7 @@ class HypothesisFusionNode(GraphNode):
         self._fusion.forget_before(start)
         self._surface.forget_before(start)
         if self._latest is not None and self._latest[0] >= start:
-            self._publish()  # the first view overtook the announcement of its episode
+            self._publish(*self._latest)  # the first view overtook the announcement of its episode
 
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
         if stamp < self._episode_start:  # the estimator was still busy with it when the scene changed
@@ -175,20 +174,16 @@ class HypothesisFusionNode(GraphNode):
             self._fusion.add_view(stamp, values["pose"], hypotheses, verification)
             self._surface.add_view(stamp, values["depth"], values["camera"], values["pose"])
             self._latest = stamp, values["pose"], values["camera"]
-            count = self._publish()
+            count = self._publish(*self._latest)
             summary.append(f"{len(hypotheses)} hypotheses, {count} objects")
 
-    def _is_latest(self, stamp: int) -> bool:
-        return self._latest is not None and stamp == self._latest[0]
-
-    def _publish(self) -> int:
+    def _publish(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> int:
         """Publish the objects after the latest view; how many there are."""
-        stamp = self._latest[0]
-        objects = self._fusion.objects(*self._latest)
+        objects = self._fusion.objects(stamp, T_world_camera, camera)
         self._objects.publish(objects_to_cloud(objects, stamp, self.world_frame))
         self._poses.publish(poses_to_array(objects.T_world_object, stamp, self.world_frame))
         shown = objects if self._mesh_uri else SceneObjects.empty()
-        self._markers.publish(objects_to_markers(shown, self._mesh_uri or "", stamp, self.world_frame))
+        self._markers.publish(objects_to_markers(shown, self._mesh_uri, stamp, self.world_frame))
         unexplained = self._surface.unexplained(objects.T_world_object)
         self._unexplained.publish(points_to_cloud(unexplained, stamp, self.world_frame))
         self._detections.publish(objects, self._model, stamp, self.world_frame)

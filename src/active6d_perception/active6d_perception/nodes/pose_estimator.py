@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import yaml
 
 from active6d_core.camera import View
 from active6d_core.object_model import load_object
@@ -50,7 +49,7 @@ class PoseEstimatorNode(GraphNode):
         """Load the object and make the estimator."""
         self._inputs.reset()
         model = load_object(self.value("object"))
-        self._estimator = create_estimator(self.value("estimator"), model, **self._read_settings())
+        self._estimator = create_estimator(self.value("estimator"), model, **self.mapping("estimator_parameters"))
 
     def teardown(self) -> None:
         """Release the estimator."""
@@ -60,17 +59,9 @@ class PoseEstimatorNode(GraphNode):
         """The camera's topics."""
         return self._inputs.awaited()
 
-    def _read_settings(self) -> dict[str, Any]:
-        try:
-            settings = yaml.safe_load(self.value("estimator_parameters"))
-        except yaml.YAMLError:
-            settings = None
-        if not isinstance(settings, dict):
-            raise ValueError(f"{self.get_name()}: parameter 'estimator_parameters' must be a YAML mapping")
-        return settings
-
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
         view = View(stamp, values["color"], values["depth"], values["camera"], values.get("pose", np.eye(4)))
+        assert self._estimator is not None, "only an active node takes views"
         with self.measure(stamp) as summary:
             found = self._estimator.estimate(view)
             summary.append(f"{len(found)} hypotheses")
