@@ -20,7 +20,6 @@ setup(
         "active6d_core",
         "active6d_perception",
         "numpy",
-        "pyyaml",
         "safetensors",
         "scipy",
         "torch",

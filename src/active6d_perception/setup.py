@@ -22,7 +22,6 @@ setup(
         "numba",
         "numpy",
         "open3d-cpu",
-        "pyyaml",
         "safetensors",
         "scipy",
         "torch",
