@@ -394,7 +394,7 @@ class DriverNode(GraphNode):
         super().__init__("driver_node", **kwargs)
         self.stamps = []
         topic = Topic("camera/depth", "sensor_msgs/msg/Image", Per.VIEW, "camera")
-        self.input(topic, lambda message: self.stamps.append(message.header.stamp.sec), from_driver=True)
+        self.input(topic, lambda message: self.stamps.append(message.header.stamp.sec))
 
 
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])
@@ -406,6 +406,20 @@ def test_every_drivers_quality_of_service_is_matched(graph, reliability, durabil
     graph.spin_until(publisher.get_subscription_count)
     publisher.publish(depth_to_image(np.ones((2, 2), np.float32), 3_000_000_000, "c"))
     graph.spin_until(lambda: node.stamps == [3])
+    (taken,) = [s.qos_profile for s in node.subscriptions if s.topic_name == "/camera/depth"]
+    assert (taken.reliability, taken.durability) == (reliability, durability)
+
+
+def test_every_big_image_of_a_reliable_volatile_driver_arrives(graph):
+    """As best effort, big messages are lost without a word."""
+    node = graph.add(DriverNode(context=graph.context))
+    publisher = graph.node.create_publisher(Image, "camera/depth", QoSProfile(depth=10))
+    graph.spin_until(publisher.get_subscription_count)
+    depth = np.full((480, 640), 0.8, np.float32)
+    for second in range(1, 21):
+        publisher.publish(depth_to_image(depth, second * 1_000_000_000, "c"))
+        graph.spin_until(lambda: node.stamps[-1:] == [second])  # noqa: B023
+    assert node.stamps == list(range(1, 21))
 
 
 @given(st.permutations([(stamp, name) for stamp in (1, 2, 3) for name in "abc"]))
@@ -439,13 +453,15 @@ def test_a_replacement_is_taken_until_the_set_is_complete():
 
 
 def test_incomplete_sets_do_not_pile_up_unnoticed():
-    synchronizer = StampSynchronizer("ab", lambda stamp, values: None, depth=4)
-    for stamp in range(4):
-        synchronizer.add("a", stamp, None)
-    for stamp in range(4, 100):
-        with pytest.raises(MessageError, match="is dropped: no b for it"):
-            synchronizer.add("a", stamp, None)
-    assert sorted(synchronizer.missing()) == [96, 97, 98, 99]
+    lost = []
+    synchronizer = StampSynchronizer("ab", lambda stamp, values: None, lambda *loss: lost.append(loss), depth=4)
+    for stamp in range(100):
+        synchronizer.add("a", stamp * 1_000_000_000, None)
+    assert lost == [(second * 1_000_000_000, ["b"]) for second in range(96)]
+    assert sorted(synchronizer.missing()) == [second * 1_000_000_000 for second in range(96, 100)]
+    synchronizer.add("b", 98 * 1_000_000_000, None)  # completes one, and overtakes those before it
+    assert lost[96:] == [(96_000_000_000, ["b"]), (97_000_000_000, ["b"])]
+    assert sorted(synchronizer.missing()) == [99 * 1_000_000_000]
 
 
 def test_a_destroyed_node_leaves_no_threads():

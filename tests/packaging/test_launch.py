@@ -31,7 +31,7 @@ def items(name: str) -> list[tuple[str, ast.expr]]:
 def test_every_argument_has_a_description():
     descriptions = {name: entry.elts[2].value for name, entry in items("ARGUMENTS")}
     wanted = (
-        "object policy seed scene steps metres estimator camera latched_camera record bag rviz namespace params_file"
+        "object policy seed scene steps metres estimator camera record bag rviz namespace params_file"
         " autostart use_sim_time play rate"
     )
     assert set(descriptions) == set(wanted.split())
@@ -50,7 +50,7 @@ def test_nodes_take_what_the_launch_file_gives(node):
 def test_every_argument_reaches_every_node_that_has_it(node):
     """But for what is one node's own: the first view's seed is the camera's, the policy's budget the policy's."""
     given = NODES[node.get_name()].launch_parameters
-    shared = {"object", "latched_camera", "metres", "steps"}
+    shared = {"object", "metres", "steps"}
     assert {name for name in shared if node.has_parameter(name)} == shared & set(given)
 
 

@@ -150,6 +150,8 @@ def test_estimator_waits_for_camera_info_and_ignores_old_stamps(graph, estimator
     assert not hypotheses
     send(graph, camera_messages(2 * SECOND), ESTIMATOR_INPUTS)
     graph.spin_until_filled([hypotheses])
+    loss = "lost (1 so far): view of 1.000 s, no camera/color/camera_info came for it"
+    graph.spin_until(lambda: loss in [d.status[0].message for d in diagnostics])
     for stamp, kind in ((2 * SECOND, "duplicate"), (SECOND, "stale")):
         diagnostics.clear()
         send(graph, camera_messages(stamp), ESTIMATOR_INPUTS[:1])

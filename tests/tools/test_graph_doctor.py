@@ -6,7 +6,7 @@ import threading
 import pytest
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import PointCloud2
 from typer.testing import CliRunner
 
 from active6d_core.ros import topics
@@ -42,6 +42,7 @@ class Viewer(GraphNode):
         super().__init__("viewer", overrides=FAST, **arguments)
         self.input(topics.CAMERA_COLOR, lambda message: None)
         self.input(topics.CAMERA_INFO, lambda message: None)
+        self.input(topics.OBJECTS, lambda message: None)
 
     def awaited(self):
         return Awaited(("camera/color/image_raw",), 12_400_000_000)
@@ -84,14 +85,14 @@ def test_a_mismatch_is_needed_and_named(spinning):
     graph, thread = spinning
     graph.add(Viewer(context=graph.context))
     driver = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
-    graph.node.create_publisher(Image, "camera/color/image_raw", driver)
+    graph.node.create_publisher(PointCloud2, "objects", driver)
     thread.start()
     checks = {check.name: check for check in examine_graph(graph.domain, seconds=2.0)}
-    check = checks["/camera/color/image_raw"]
+    check = checks["/objects"]
     assert (check.ok, check.needed) == (False, True)
     assert check.detail.startswith("tester does not reach viewer: ")
     assert "transient local" in check.detail
-    assert "latched_camera:=false" in check.fix
+    assert "qos_overrides" in check.fix
 
 
 def test_the_cause_that_a_node_knows_is_passed_on(spinning):

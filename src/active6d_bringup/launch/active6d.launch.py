@@ -33,7 +33,6 @@ ARGUMENTS = {
     "policy": ("", None, "which policy chooses the views; empty: as in params_file"),
     "steps": ("", None, "moves in an episode; empty: as in params_file"),
     "metres": ("", None, "travel budget of an episode in metres, 0.0: none; empty: as in params_file"),
-    "latched_camera": ("", ["", "true", "false"], "false for a driver that keeps no views; empty: as in params_file"),
     "autostart": ("true", ["true", "false"], "nodes configure and activate themselves; false: `ros2 lifecycle set`"),
     "use_sim_time": ("false", ["true", "false"], "take the nodes' clock from /clock; stamps of views never do"),
     "play": ("", None, "folder of the bag to play, with camera:=bag"),
@@ -49,7 +48,6 @@ TYPES = {
     "steps": int,
     "metres": float,
     "rate": float,
-    "latched_camera": bool,
     "autostart": bool,
     "use_sim_time": bool,
 }

@@ -123,7 +123,7 @@ def _check_topics(listener: _Listener, seconds: float) -> Iterator[Check]:
             continue
         mismatches = list(_mismatches(publishers, subscribers))
         if mismatches:
-            fix = "camera topics: set latched_camera:=false on the nodes; else see qos_overrides in docs/graph.md"
+            fix = "publish what the subscriber asks for, or see qos_overrides in docs/graph.md"
             yield Check("Topics", topic, False, True, "; ".join(mismatches), fix)
         elif name != _DIAGNOSTICS and not listener.received[name]:
             # Topics that are not transient local are silent whenever nothing is decided.

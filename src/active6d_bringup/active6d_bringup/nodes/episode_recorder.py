@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from active6d_bringup.bags.writer import EpisodeWriter
+from active6d_core.ros.adaptive_subscription import AdaptiveSubscription
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
 from active6d_core.ros.topics import CONTRACT, EPISODE_END, Topic, describe_missing
@@ -25,9 +25,6 @@ class EpisodeRecorderNode(GraphNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("episode_recorder", **options)
         self.declare("bag", "", "folder to create for the bag")
-        self.declare(
-            "latched_camera", True, "camera topics are transient local; false for plain camera drivers", fixed=True
-        )
         self.declare("settings", "{}", "parameters of the other nodes as JSON, kept in metadata.yaml for replay")
         self._writer: EpisodeWriter | None = None
         self._subscriptions_by_topic = {topic.name: self._listen(topic) for topic in CONTRACT}
@@ -43,7 +40,7 @@ class EpisodeRecorderNode(GraphNode):
         self._folder = self.value("bag")
         if not self._folder:
             raise ValueError("episode_recorder: parameter 'bag' must name a folder to create")
-        names = {topic: subscription.topic_name for topic, subscription in self._subscriptions_by_topic.items()}
+        names = {topic: each.subscription.topic_name for topic, each in self._subscriptions_by_topic.items()}
         self._writer = EpisodeWriter(Path(self._folder).expanduser(), names, self.value("settings"))
         self.get_logger().info(f"recording into {self._folder}")
 
@@ -63,7 +60,8 @@ class EpisodeRecorderNode(GraphNode):
 
     def drain(self) -> None:
         """Write everything that has arrived but waits for its callback."""
-        for topic, subscription in self._subscriptions_by_topic.items():
+        for topic, adaptive in self._subscriptions_by_topic.items():
+            subscription = adaptive.subscription
             while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
                 self._write(topic, taken[0])
 
@@ -71,15 +69,13 @@ class EpisodeRecorderNode(GraphNode):
         """Topics that the recording of an episode ending at the view with this stamp (ns) still waits for."""
         return self._writer.missing(stamp) if self._writer is not None else []
 
-    def _listen(self, topic: Topic) -> Subscription:
-        from_driver = topic.from_camera and not self.value("latched_camera")
-        latched = topic.transient_local and not from_driver
+    def _listen(self, topic: Topic) -> AdaptiveSubscription:
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_ALL,
-            reliability=ReliabilityPolicy.BEST_EFFORT if from_driver else ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.transient_local else DurabilityPolicy.VOLATILE,
         )
-        return self.create_subscription(topic.message_type, topic.name, partial(self._write, topic.name), qos, raw=True)
+        return AdaptiveSubscription(self, topic, partial(self._write, topic.name), qos, raw=True)
 
     def _write(self, topic: str, payload: bytes) -> None:
         if self._writer is not None:

@@ -30,25 +30,23 @@ class NodeEntry:
 
 #: Node name to entry. Their order is the order of starting: a subscriber comes before what it listens to.
 NODES = {
-    "episode_recorder": NodeEntry(
-        "active6d_bringup.nodes.episode_recorder", "EpisodeRecorderNode", ("bag", "latched_camera")
-    ),
+    "episode_recorder": NodeEntry("active6d_bringup.nodes.episode_recorder", "EpisodeRecorderNode", ("bag",)),
     "attention_policy": NodeEntry(
         "active6d_agent.nodes.attention_policy",
         "AttentionPolicyNode",
-        ("object", "policy", "seed", "steps", "metres", "latched_camera"),
+        ("object", "policy", "seed", "steps", "metres"),
     ),
     # These two get their inputs back when they start again: they are transient local.
     "hypothesis_fusion": NodeEntry(
         "active6d_perception.nodes.hypothesis_fusion",
         "HypothesisFusionNode",
-        ("object", "latched_camera"),
+        ("object",),
         restarted=True,
     ),
     "pose_estimator": NodeEntry(
         "active6d_perception.nodes.pose_estimator",
         "PoseEstimatorNode",
-        ("object", "estimator", "latched_camera"),
+        ("object", "estimator"),
         restarted=True,
     ),
     "bag_player": NodeEntry("active6d_bringup.nodes.bag_player", "BagPlayerNode", ("bag", "rate")),

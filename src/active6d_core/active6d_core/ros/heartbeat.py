@@ -51,8 +51,7 @@ class Watch:
     def mismatch(self, topic: str, policy: int) -> str:
         """Note that a publisher offers less than this node requests on a topic; the cause in words."""
         kind = QoSPolicyKind(policy).name.lower()
-        hint = "; set latched_camera:=false for a camera driver" * topic.startswith("camera/")
-        self._mismatched[topic] = f"a publisher of {topic} offers an incompatible QoS ({kind}){hint}"
+        self._mismatched[topic] = f"a publisher of {topic} offers an incompatible QoS ({kind})"
         return self._mismatched[topic]
 
     def outdated(self, reason: str) -> None:

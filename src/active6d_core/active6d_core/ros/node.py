@@ -21,6 +21,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
+from active6d_core.ros.adaptive_subscription import AdaptiveSubscription
 from active6d_core.ros.conversions import HARDWARE_ID, MessageError, OutdatedError, ns_to_stamp
 from active6d_core.ros.heartbeat import Awaited, Watch
 from active6d_core.ros.parameters import ParameterNode
@@ -57,6 +58,7 @@ class GraphNode(ParameterNode):
         self._failure: Exception | None = None
         self._views_measured = 0
         self._rejected = 0
+        self._lost = 0
         self._last_view_at: float | None = None
         self._last_cause = ""
         self._watch = Watch(self)
@@ -102,40 +104,43 @@ class GraphNode(ParameterNode):
             topic.message_type, topic.name, _qos(topic), qos_overriding_options=_overridable()
         )
 
-    def input(self, topic: Topic, callback: Callable[[Any], None], from_driver: bool = False) -> Subscription:
-        """A subscription of a topic; a message for which the callback raises :class:`MessageError` is refused.
+    def input(self, topic: Topic, callback: Callable[[Any], None]) -> None:
+        """Subscribe to a topic; a message for which the callback raises :class:`MessageError` is refused.
 
-        ``from_driver`` takes messages as sensor data (best effort, volatile), which matches every camera driver.
+        A camera's topic is taken with the quality of service that its publisher offers, whatever driver that is.
         """
         qos = _qos(topic)
-        if from_driver:
-            qos.reliability, qos.durability = ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE
-        return self._subscribe(topic.message_type, topic.name, callback, qos)
-
-    def _subscribe(
-        self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
-    ) -> Subscription:
-        latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        held: deque[Any] = deque(maxlen=qos.depth if latched else 0)
+        held: deque[Any] = deque(maxlen=qos.depth)
 
         def guarded(message: Any) -> None:
             if not self._active:
-                held.append(message)
+                if subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+                    held.append(message)
                 return
-            self.guard(topic, partial(callback, message))
+            self.guard(topic.name, partial(callback, message))
 
         def incompatible(event: Any) -> None:
-            self.get_logger().warning(self._watch.mismatch(topic, event.last_policy_kind))
+            cause = self._watch.mismatch(topic.name, event.last_policy_kind)
+            if not topic.from_camera:
+                self.get_logger().warning(cause)
 
         self._held.append((guarded, held))
-        return self.create_subscription(
-            message_type,
-            topic,
-            guarded,
-            qos,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
-            qos_overriding_options=_overridable(),
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=incompatible,
+            message_lost=lambda event: self.lose(f"{event.total_count_change} messages of {topic.name}"),
         )
+        subscription: AdaptiveSubscription | Subscription
+        if topic.from_camera:
+            subscription = AdaptiveSubscription(self, topic, guarded, qos, _overridable(), events)
+        else:
+            subscription = self.create_subscription(
+                topic.message_type,
+                topic.name,
+                guarded,
+                qos,
+                event_callbacks=events,
+                qos_overriding_options=_overridable(),
+            )
 
     def guard(self, topic: str, action: Callable[[], None]) -> None:
         """Do what input on a topic causes; a :class:`MessageError` is reported and nothing else."""
@@ -153,6 +158,13 @@ class GraphNode(ParameterNode):
         self._rejected += 1
         self.get_logger().error(reason, throttle_duration_sec=_LOG_PERIOD_SECONDS)
         self._diagnose(DiagnosticStatus.ERROR, reason, 0, {})
+
+    def lose(self, what: str) -> None:
+        """Log input that is lost, such as an incomplete view (throttled), and count and publish it on /diagnostics."""
+        self._lost += 1
+        text = f"lost ({self._lost} so far): {what}"
+        self.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_SECONDS)
+        self._diagnose(DiagnosticStatus.WARN, text, 0, {})
 
     def _ignore(self, reason: str) -> None:
         """Drop a message of a view that is over: a neighbour that was restarted repeats its last messages."""
@@ -206,7 +218,8 @@ class GraphNode(ParameterNode):
         self._diagnose(DiagnosticStatus.WARN if cause else DiagnosticStatus.OK, text, now, values)
 
     def _diagnose(self, level: bytes, message: str, stamp: int, values: dict[str, str]) -> None:
-        values = {**values, "views": str(self._views_measured), "rejected": str(self._rejected)}
+        values = {**values, "views": str(self._views_measured)}
+        values |= {"rejected": str(self._rejected), "lost": str(self._lost)}
         status = DiagnosticStatus(
             level=level, name=self.get_fully_qualified_name(), message=message, hardware_id=HARDWARE_ID
         )

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from active6d_core.ros.conversions import MessageError, OutdatedError
+from active6d_core.ros.conversions import OutdatedError
 
 
 class StampSynchronizer:
@@ -12,12 +12,20 @@ class StampSynchronizer:
     Args:
         names: what makes a set complete.
         callback: called with the stamp (ns) and {name: value}.
+        on_loss: called with the stamp (ns) of every set that stays incomplete, and the names that it lacks.
         depth: incomplete stamps kept, more than a transient local topic repeats; the oldest is dropped first.
     """
 
-    def __init__(self, names: Sequence[str], callback: Callable[[int, dict[str, Any]], None], depth: int = 16) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        callback: Callable[[int, dict[str, Any]], None],
+        on_loss: Callable[[int, list[str]], None] = lambda stamp, absent: None,
+        depth: int = 16,
+    ) -> None:
         self._names = frozenset(names)
         self._callback = callback
+        self._on_loss = on_loss
         self._depth = depth
         self._pending: dict[int, dict[str, Any]] = {}
         self._last_complete = -1
@@ -27,7 +35,6 @@ class StampSynchronizer:
 
         Raises:
             OutdatedError: the stamp was completed already, or is older than the last complete one.
-            MessageError: the value is taken, but an older incomplete set had to make room.
         """
         if stamp <= self._last_complete:
             kind = "duplicate" if stamp == self._last_complete else "stale"
@@ -36,14 +43,16 @@ class StampSynchronizer:
             )
         self._pending.setdefault(stamp, {})[name] = value
         if self._pending[stamp].keys() == self._names:
-            values = self._pending[stamp]
+            values = self._pending.pop(stamp)
             self._last_complete = stamp
-            self._pending = {later: kept for later, kept in self._pending.items() if later > stamp}
+            for overtaken in sorted(earlier for earlier in self._pending if earlier < stamp):
+                self._drop(overtaken)
             self._callback(stamp, values)
         elif len(self._pending) > self._depth:
-            oldest = min(self._pending)
-            absent = ", ".join(sorted(self._names - self._pending.pop(oldest).keys()))
-            raise MessageError(f"view of {oldest * 1e-9:.3f} s is dropped: no {absent} for it")
+            self._drop(min(self._pending))
+
+    def _drop(self, stamp: int) -> None:
+        self._on_loss(stamp, sorted(self._names - self._pending.pop(stamp).keys()))
 
     def missing(self) -> dict[int, set[str]]:
         """Names still awaited, per incomplete stamp."""

@@ -56,7 +56,7 @@ class Topic:
 
     @property
     def from_camera(self) -> bool:
-        """Whether a camera driver publishes it, with the durability that the parameter ``latched_camera`` says."""
+        """Whether a camera driver publishes it; its subscribers take the quality of service that the driver offers."""
         return self.name.startswith("camera/")
 
 

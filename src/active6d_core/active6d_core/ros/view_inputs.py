@@ -35,7 +35,7 @@ class ViewInputs:
     """Subscribes to a camera and hands on complete views, whose images have the size that ``camera_info`` says.
 
     Args:
-        node: the node that subscribes; it gets the parameters ``latched_camera`` and ``pose_source``.
+        node: the node that subscribes; it gets the parameter ``pose_source``.
         parts: what it needs of the camera: of ``camera``, ``color``, ``depth`` and ``pose``.
         callback: called with the stamp in ns and {part: value}.
         others: what else belongs to a view, as {part: topic}; the node hands it to :meth:`add`.
@@ -51,9 +51,6 @@ class ViewInputs:
         self._node, self._callback = node, callback
         self._topics = {**{part: _CAMERA[part][0].name for part in parts}, **(others or {})}
         node.declare(
-            "latched_camera", True, "camera topics are transient local; false for plain camera drivers", fixed=True
-        )
-        node.declare(
             "pose_source",
             "topic",
             "topic: the camera's pose comes from camera/pose; tf: from /tf (needs tf2_ros)",
@@ -67,12 +64,12 @@ class ViewInputs:
         for part in parts:
             if part != "pose" or self._transforms is None:
                 topic, _ = _CAMERA[part]
-                node.input(topic, partial(self._take, part), from_driver=not node.value("latched_camera"))
+                node.input(topic, partial(self._take, part))
         self.reset()
 
     def reset(self) -> None:
         """Forget all that has come."""
-        self._views = StampSynchronizer(list(self._topics), self._on_complete)
+        self._views = StampSynchronizer(list(self._topics), self._on_complete, self._on_loss)
         self._requested = self._latest = -1
 
     def add(self, part: str, stamp: int, value: Any) -> None:
@@ -102,6 +99,10 @@ class ViewInputs:
     def _take(self, part: str, message: Any) -> None:
         require_frame(message.header, self._node.world_frame if part == "pose" else self._node.camera_frame)
         self.add(part, stamp_to_ns(message.header.stamp), _CAMERA[part][1](message))
+
+    def _on_loss(self, stamp: int, absent: list[str]) -> None:
+        topics = ", ".join(self._topics[part] for part in absent)
+        self._node.lose(f"view of {stamp * 1e-9:.3f} s, no {topics} came for it")
 
     def _on_complete(self, stamp: int, values: dict[str, Any]) -> None:
         self._latest = stamp
