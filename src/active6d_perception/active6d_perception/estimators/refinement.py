@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from active6d_core.camera import PinholeCamera, project
 from active6d_perception.model.model_views import ModelViews
+from active6d_perception.registration import point_to_plane_step
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,26 +116,8 @@ def refine(
             matched = valid & np.isfinite(distance)
             nearest = np.where(matched, nearest, 0)
             matched &= np.einsum("ksi,ksi->ks", scene_normals[nearest], normals) > 0.5
-            T = _point_to_plane_step(T, points, normals, scene.data[nearest], matched)
+            T = point_to_plane_step(T, points, normals, scene.data[nearest], matched)
     return T
-
-
-def _point_to_plane_step(
-    T: np.ndarray, points: np.ndarray, normals: np.ndarray, targets: np.ndarray, matched: np.ndarray
-) -> np.ndarray:
-    """One Gauss-Newton step for (k, 4, 4) poses, each rotated about its own origin to keep the system well scaled."""
-    arms = points - T[:, None, :3, 3]
-    jacobian = np.concatenate([np.cross(arms, normals), normals], axis=-1) * matched[..., None]
-    residual = np.einsum("ksi,ksi->ks", targets - points, normals) * matched
-    A = np.swapaxes(jacobian, 1, 2) @ jacobian
-    # Damping keeps the pose from moving where the points leave it free, as about the axis of a cup.
-    A += np.eye(6) * (1e-4 * np.trace(A, axis1=1, axis2=2)[:, None, None] / 6 + 1e-12)
-    step = np.linalg.solve(A, np.einsum("ksi,ks->ki", jacobian, residual)[..., None])[..., 0]
-    step[matched.sum(axis=1) < 6] = 0.0
-    moved = T.copy()
-    moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ T[:, :3, :3]
-    moved[:, :3, 3] += step[:, 3:]
-    return moved
 
 
 def claim_pixels(
