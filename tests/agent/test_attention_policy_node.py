@@ -378,6 +378,7 @@ def test_bad_poses_are_refused_and_the_node_lives(episode, damage, complaint):
 
 def test_a_stale_view_is_ignored(episode):
     played = episode(steps=4)
+    played.pose(4, 2 * SECOND)
     played.view(3, 5 * SECOND)
     played.graph.spin_until(lambda: len(played.goals) == 1)
     played.view(4, 2 * SECOND)

@@ -423,19 +423,29 @@ def test_every_big_image_of_a_reliable_volatile_driver_arrives(graph):
 
 
 @given(st.permutations([(stamp, name) for stamp in (1, 2, 3) for name in "abc"]))
-def test_complete_sets_come_in_order_whatever_the_arrival(arrivals):
-    complete = []
-    synchronizer = StampSynchronizer("abc", lambda stamp, values: complete.append((stamp, values)))
+def test_sets_are_handed_on_once_and_never_after_a_newer_one_that_they_began_before(arrivals):
+    complete, dropped, refused = [], [], []
+    synchronizer = StampSynchronizer(
+        "abc", lambda stamp, values: complete.append((stamp, values)), lambda stamp, absent: dropped.append(stamp)
+    )
     for stamp, name in arrivals:
         try:
             synchronizer.add(name, stamp, f"{name}{stamp}")
         except MessageError:
-            assert complete[-1][0] >= stamp
+            refused.append(stamp)
     stamps = [stamp for stamp, _ in complete]
-    assert stamps == sorted(set(stamps))
-    # The newest stamp always completes: nothing newer can make it stale.
-    assert stamps[-1] == 3
     assert all(values == {name: f"{name}{stamp}" for name in "abc"} for stamp, values in complete)
+    # By hand: a set is dropped when a newer one completes while it is begun and incomplete.
+    ends = {stamp: max(at for at, (other, _) in enumerate(arrivals) if other == stamp) for stamp in (1, 2, 3)}
+    begins = {stamp: min(at for at, (other, _) in enumerate(arrivals) if other == stamp) for stamp in (1, 2, 3)}
+    expected, over = [], set()
+    for stamp in sorted(ends, key=ends.get):
+        if stamp not in over:
+            expected.append(stamp)
+            over |= {older for older in range(1, stamp) if begins[older] < ends[stamp] < ends[older]}
+    assert stamps == expected
+    assert sorted(dropped) == sorted(over)
+    assert set(refused) == over
 
 
 def test_a_replacement_is_taken_until_the_set_is_complete():
@@ -444,12 +454,13 @@ def test_a_replacement_is_taken_until_the_set_is_complete():
     synchronizer.add("a", 1, "first")
     synchronizer.add("a", 1, "again")
     assert synchronizer.missing() == {1: {"b"}}
-    synchronizer.add("b", 1, "b")
-    assert complete == [{"a": "again", "b": "b"}]
-    with pytest.raises(MessageError, match="duplicate"):
+    synchronizer.add("a", 2, "a")
+    synchronizer.add("b", 2, "b")
+    assert complete == [{"a": "a", "b": "b"}]
+    with pytest.raises(OutdatedError, match="duplicate"):
+        synchronizer.add("b", 2, "b")
+    with pytest.raises(OutdatedError, match="stale"):
         synchronizer.add("b", 1, "b")
-    with pytest.raises(MessageError, match="stale"):
-        synchronizer.add("b", 0, "b")
 
 
 def test_incomplete_sets_do_not_pile_up_unnoticed():
@@ -462,6 +473,18 @@ def test_incomplete_sets_do_not_pile_up_unnoticed():
     synchronizer.add("b", 98 * 1_000_000_000, None)  # completes one, and overtakes those before it
     assert lost[96:] == [(96_000_000_000, ["b"]), (97_000_000_000, ["b"])]
     assert sorted(synchronizer.missing()) == [99 * 1_000_000_000]
+
+
+@given(st.lists(st.integers(10**9, 2 * 10**18), min_size=1, max_size=100))
+def test_lone_messages_of_any_stamp_leave_room_for_what_comes_next(stamps):
+    complete = []
+    synchronizer = StampSynchronizer("ab", lambda stamp, values: complete.append(stamp))
+    for stamp in stamps:
+        synchronizer.add("a", stamp, None)
+    for stamp in (10, 11):
+        synchronizer.add("a", stamp, None)
+        synchronizer.add("b", stamp, None)
+    assert complete == [10, 11]
 
 
 def test_a_destroyed_node_leaves_no_threads():

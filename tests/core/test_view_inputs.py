@@ -5,13 +5,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo
 
 from active6d_core.camera import PinholeCamera
-from active6d_core.ros.conversions import camera_to_info, transform_to_pose, transform_to_pose_stamped
+from active6d_core.ros.conversions import camera_to_info, ns_to_stamp, transform_to_pose, transform_to_pose_stamped
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.view_inputs import ViewInputs
@@ -132,10 +133,131 @@ def test_without_tf2_the_parameter_is_refused(graph, monkeypatch):
         Viewer(context=graph.context, overrides={"pose_source": "tf"})
 
 
-def test_the_newest_view_is_the_one_of_which_anything_came(graph):
+def test_a_view_is_under_way_when_anything_of_it_has_come(graph):
     viewer = graph.add(Viewer(context=graph.context))
-    assert viewer.inputs.newest == -1
+    assert not viewer.inputs.under_way
     send_info(graph, SECOND)
-    graph.spin_until(lambda: viewer.inputs.newest == SECOND)
+    graph.spin_until(lambda: viewer.inputs.under_way)
     info = [s for s in viewer.subscriptions if s.msg_type is CameraInfo]
     assert len(info) == 1
+
+
+# Stamps that no camera of this episode would send, given to the callbacks as an executor would
+
+
+class Follower(GraphNode):
+    """Keeps the views of the announced episode."""
+
+    def __init__(self, **arguments):
+        super().__init__("follower", **arguments)
+        self.views = []
+        self.inputs = ViewInputs(self, ["camera", "pose"], lambda stamp, view: self.views.append(stamp), None, self.on)
+
+    def on(self, start, new):
+        first = self.views.index(start.stamp) if not new else len(self.views)
+        self.views = self.views[first:]
+
+    def take(self, topic, message):
+        (subscription,) = [s for s in self.subscriptions if s.topic_name == f"/{topic}"]
+        subscription.callback(message)
+
+    def info(self, stamp):
+        self.take("camera/color/camera_info", restamped(camera_to_info(CAMERA, 0, "camera_optical_frame"), stamp))
+
+    def pose(self, stamp):
+        self.take("camera/pose", restamped(transform_to_pose_stamped(POSES[0], 0, "world"), stamp))
+
+    def view(self, stamp):
+        self.info(stamp)
+        self.pose(stamp)
+
+    def announce(self, stamp):
+        self.take("episode/start", restamped(DiagnosticArray(status=[DiagnosticStatus()]), stamp))
+
+
+def restamped(message, stamp):
+    message.header.stamp = stamp if isinstance(stamp, Time) else ns_to_stamp(stamp)
+    return message
+
+
+@pytest.fixture
+def follower(graph):
+    return graph.add(Follower(context=graph.context))
+
+
+FUTURE = 2_000_000_000 * SECOND
+BAD = [Time(sec=-5), Time(sec=8, nanosec=10**9), Time(sec=2**31 - 1, nanosec=2**32 - 1), Time()]
+ATTACKS = {
+    "one lone info": lambda node: node.info(FUTURE),
+    "sixteen lone infos": lambda node: [node.info(FUTURE + step) for step in range(16)],
+    "a hundred lone poses": lambda node: [node.pose(FUTURE + step) for step in range(100)],
+    "a whole view": lambda node: node.view(FUTURE),
+    "a start": lambda node: Follower.announce(node, FUTURE),
+    "a start and its view": lambda node: (Follower.announce(node, FUTURE), node.view(FUTURE)),
+    "a view and its start": lambda node: (node.view(FUTURE), Follower.announce(node, FUTURE)),
+    "a start of the past": lambda node: Follower.announce(node, SECOND),
+    "stamps that are no time": lambda node: [
+        take(node, bad) for bad in BAD for take in (Follower.info, Follower.pose, Follower.announce)
+    ],
+}
+
+
+@pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS)
+def test_no_stamp_makes_a_node_deaf(follower, attack):
+    follower.view(10 * SECOND)
+    attack(follower)
+    follower.views.clear()
+    for second in range(11, 31):
+        follower.view(second * SECOND)
+    assert follower.views == [second * SECOND for second in range(11, 31)]
+
+
+def test_stamps_that_are_no_time_are_refused(follower):
+    for bad in BAD:
+        follower.view(bad)
+    assert follower._rejected == 2 * len(BAD)
+    assert follower.views == []
+
+
+def test_an_episode_may_begin_earlier_than_the_last(follower):
+    for stamp in (FUTURE, FUTURE + SECOND):
+        follower.view(stamp)
+    follower.announce(SECOND)
+    for stamp in (SECOND, 2 * SECOND):
+        follower.view(stamp)
+    assert follower.views == [SECOND, 2 * SECOND]
+
+
+@pytest.mark.parametrize("announced_first", [True, False])
+def test_a_restarted_camera_may_repeat_its_stamps(follower, announced_first):
+    follower.announce(SECOND)
+    for stamp in (SECOND, 2 * SECOND):
+        follower.view(stamp)
+    if announced_first:
+        follower.announce(SECOND)
+        follower.view(SECOND)
+    else:
+        follower.view(SECOND)
+        follower.announce(SECOND)
+    follower.view(2 * SECOND)
+    assert follower.views == [SECOND, 2 * SECOND]
+
+
+def test_a_late_announcement_ends_only_what_came_before_its_view(follower):
+    for stamp in (SECOND, 2 * SECOND, 3 * SECOND):
+        follower.view(stamp)
+    follower.announce(2 * SECOND)
+    assert follower.views == [2 * SECOND, 3 * SECOND]
+
+
+def test_what_is_left_incomplete_is_counted_and_reported_once(graph, follower):
+    diagnostics = graph.mailbox(DiagnosticArray, "/diagnostics")
+    follower.info(SECOND)
+    for _ in range(3):
+        follower.view(2 * SECOND)
+    graph.spin_until(lambda: any("lost" in {v.key for v in d.status[0].values} for d in diagnostics))
+    follower.beat()
+    graph.spin_until(lambda: diagnostics[-1].status[0].message.startswith(("ready", "waiting")))
+    assert {v.key: v.value for v in diagnostics[-1].status[0].values}["lost"] == "1"
+    reports = [d.status[0].message for d in diagnostics if "came for it" in d.status[0].message]
+    assert reports == ["lost (1 so far): view of 1.000 s, no camera/pose came for it"]

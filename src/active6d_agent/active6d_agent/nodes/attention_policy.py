@@ -14,14 +14,13 @@ from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
 from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
-    OutdatedError,
     attention_to_cloud,
     objects_from_cloud,
     points_from_cloud,
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.ros.episode_messages import EpisodeEnd, GoalState, GoalStatus
+from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, GoalState, GoalStatus
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
@@ -67,8 +66,7 @@ class AttentionPolicyNode(GraphNode):
         self.end = self.output(topics.EPISODE_END)
         self.input(topics.OBJECTS, self._on_objects)
         self.input(topics.UNEXPLAINED, self._on_unexplained)
-        self._views = ViewInputs(self, ["pose"], self._on_view, _OTHERS)
-        self.input(topics.EPISODE_START, self._on_start)
+        self._views = ViewInputs(self, ["pose"], self._on_view, _OTHERS, self._on_start)
         self.input(topics.GOAL_STATUS, self._on_status)
         self._timer = None
         self._forget()
@@ -139,16 +137,16 @@ class AttentionPolicyNode(GraphNode):
             raise ValueError(f"{self.get_name()}: the parameters 'reach_*' leave no view of the grid")
         return sphere, allowed
 
-    def _on_start(self, message: DiagnosticArray) -> None:
-        start = stamp_to_ns(message.header.stamp)
-        if self._episode is not None and start <= self._episode.start:
+    def _on_start(self, start: EpisodeStart, new: bool) -> None:
+        views = {} if new or self._episode is None else self._episode.views_from(start.stamp)
+        episode = self._begin_episode(start.stamp)
+        if new:
+            self._latest = None
             return
-        # The first view may have overtaken the announcement of its episode.
-        views = {} if self._episode is None else self._episode.views_since(start)
-        episode = self._begin_episode(start)
+        # The first view overtook the announcement of its episode.
         for stamp, position in views.items():
             episode.add_view(stamp, position)
-        if self._latest is not None and self._latest[0] >= start:
+        if self._latest is not None and views:
             self._decide(episode, *self._latest)
 
     def _begin_episode(self, start: int) -> EpisodeState:
@@ -176,8 +174,6 @@ class AttentionPolicyNode(GraphNode):
 
     def _on_view(self, stamp: int, view: dict[str, Any]) -> None:
         episode = self._episode or self._begin_episode(stamp)
-        if stamp < episode.start:
-            raise OutdatedError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
         self._latest = (stamp, view["objects"], view["unexplained"])
         episode.add_view(stamp, view["pose"][:3, 3])
         self._published = []
@@ -201,7 +197,7 @@ class AttentionPolicyNode(GraphNode):
         episode, latest = self._episode, self._latest
         if episode is None or latest is None or not self._active:
             return
-        if self._views.newest > latest[0]:  # of a camera that does not answer goals
+        if self._views.under_way:  # of a camera that does not answer goals
             episode.reached()
         if episode.wait(seconds):
             timeout = self.value("goal_timeout")

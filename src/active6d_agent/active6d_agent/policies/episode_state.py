@@ -77,9 +77,11 @@ class EpisodeState:
         self._positions[stamp] = position
         self.reached()
 
-    def views_since(self, stamp: int) -> dict[int, np.ndarray]:
-        """Stamp (ns) to position of the views that are not older than ``stamp``."""
-        return {at: position for at, position in self._positions.items() if at >= stamp}
+    def views_from(self, stamp: int) -> dict[int, np.ndarray]:
+        """Stamp (ns) to position of the view of ``stamp`` and of those taken after it; empty without that view."""
+        stamps = list(self._positions)
+        first = stamps.index(stamp) if stamp in self._positions else len(stamps)
+        return {at: self._positions[at] for at in stamps[first:]}
 
     def decide(self, policy: Policy, objects: SceneObjects, unexplained: np.ndarray) -> tuple[Decision | None, str]:
         """The policy's decision on the last view, and why the episode ends: empty text when the decision is a goal.

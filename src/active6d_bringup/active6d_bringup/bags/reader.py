@@ -124,8 +124,8 @@ def read_episodes(bag: Path | str | BagIndex) -> list[EpisodeRecord]:
         BagError: no bag, a broken one, or one without a complete view.
     """
     index = bag if isinstance(bag, BagIndex) else read_bag(Path(bag))
-    messages, latencies = _read_messages(index)
     try:
+        messages, latencies = _read_messages(index)
         return _episodes(index.folder, messages, latencies)
     except MessageError as error:
         raise BagError(f"{index.folder}: {error}") from error

@@ -30,6 +30,7 @@ from active6d_bringup.graph.composition import (
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
+    MessageError,
     latencies_from_diagnostics,
     objects_from_cloud,
     pose_stamped_to_transform,
@@ -253,7 +254,7 @@ def _spin_to_end(
         if interrupted.is_set():
             raise EpisodeInterrupted
         awaited = monitor.missing()
-        unrecorded = [] if awaited else graph.missing(monitor.last)
+        unrecorded = [] if awaited else graph.missing(monitor.end_stamp)
         if not awaited and not unrecorded:
             return
         if progress != (monitor.received, monitor.end_stamp):
@@ -304,13 +305,13 @@ class EpisodeMonitor(Node):
 
     @property
     def last(self) -> int:
-        """Stamp in nanoseconds of the last view so far, 0 before the first."""
-        return max(self._poses, default=0)
+        """Stamp in nanoseconds of the view that came last, 0 before the first."""
+        return next(reversed(self._poses), 0)
 
     def missing(self) -> list[str]:
         """The topic that the episode waits for next; nothing when it has ended."""
         view = self.last
-        if self.end_stamp is not None and self.end_stamp == view and view in self._objects:
+        if self.end_stamp in self._poses and self.end_stamp in self._objects:
             return []
         # A goal whose view does not come was refused or is under way: either way it is the camera's turn.
         if not view or view in self._goals:
@@ -338,7 +339,11 @@ class EpisodeMonitor(Node):
         qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
         def heard(message: Any) -> None:
-            callback(message)
+            try:
+                callback(message)
+            except MessageError as error:
+                self.last_refusal = [f"the command refused {topic.name}: {error}"]
+                return
             self.received += topic is not topics.DIAGNOSTICS
             self._report_steps()
 

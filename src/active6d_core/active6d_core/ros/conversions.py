@@ -70,7 +70,13 @@ class OutdatedError(MessageError):
 
 
 def stamp_to_ns(stamp: Time) -> int:
-    """A message's stamp in nanoseconds."""
+    """A message's stamp in nanoseconds.
+
+    Raises:
+        MessageError: the stamp is negative, or its nanoseconds make a second or more.
+    """
+    if stamp.sec < 0 or not 0 <= stamp.nanosec < 1_000_000_000:
+        raise MessageError(f"stamp of {stamp.sec} s and {stamp.nanosec} ns is no time; check the publisher's clock")
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 

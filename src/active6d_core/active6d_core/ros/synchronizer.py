@@ -5,15 +5,22 @@ from typing import Any
 
 from active6d_core.ros.conversions import OutdatedError
 
+#: Stamps remembered as over; a restarted node repeats far fewer messages.
+_REMEMBERED = 256
+
 
 class StampSynchronizer:
-    """Collects one value per name for each stamp and hands complete sets on, in order of their stamps.
+    """Collects one value per name for each stamp and hands complete sets on.
+
+    Order of arrival decides what is old, never the stamps themselves. A single message stamped in the future would
+    otherwise make everything after it look outdated.
 
     Args:
         names: what makes a set complete.
         callback: called with the stamp (ns) and {name: value}.
         on_loss: called with the stamp (ns) of every set that stays incomplete, and the names that it lacks.
-        depth: incomplete stamps kept, more than a transient local topic repeats; the oldest is dropped first.
+        depth: incomplete sets kept, more than a transient local topic repeats; the one that began first is dropped
+            first, never the one that has just come.
     """
 
     def __init__(
@@ -28,32 +35,48 @@ class StampSynchronizer:
         self._on_loss = on_loss
         self._depth = depth
         self._pending: dict[int, dict[str, Any]] = {}
-        self._last_complete = -1
+        self._over: dict[int, str] = {}
 
     def add(self, name: str, stamp: int, value: Any) -> None:
         """Take a value; a second one for an incomplete stamp replaces the first (its sender was restarted).
 
+        A complete set ends the sets with smaller stamps that are still incomplete.
+
         Raises:
-            OutdatedError: the stamp was completed already, or is older than the last complete one.
+            OutdatedError: the set of this stamp was completed or ended already.
         """
-        if stamp <= self._last_complete:
-            kind = "duplicate" if stamp == self._last_complete else "stale"
-            raise OutdatedError(
-                f"{kind} stamp {stamp * 1e-9:.3f} s of {name}, already at {self._last_complete * 1e-9:.3f} s"
-            )
+        if stamp in self._over:
+            raise OutdatedError(f"{self._over[stamp]} {stamp * 1e-9:.3f} s of {name}")
         self._pending.setdefault(stamp, {})[name] = value
         if self._pending[stamp].keys() == self._names:
             values = self._pending.pop(stamp)
-            self._last_complete = stamp
-            for overtaken in sorted(earlier for earlier in self._pending if earlier < stamp):
-                self._drop(overtaken)
+            self._close(stamp, "duplicate stamp")
+            for earlier in [other for other in self._pending if other < stamp]:
+                self._drop(earlier)
             self._callback(stamp, values)
         elif len(self._pending) > self._depth:
-            self._drop(min(self._pending))
+            # A stamp that has lost its place may come again: whoever sends it, it is not over.
+            oldest = next(iter(self._pending))
+            self._on_loss(oldest, sorted(self._names - self._pending.pop(oldest).keys()))
 
-    def _drop(self, stamp: int) -> None:
-        self._on_loss(stamp, sorted(self._names - self._pending.pop(stamp).keys()))
+    def end_before(self, stamp: int) -> None:
+        """End the incomplete sets that began before the one of ``stamp``; all of them if that one has not begun."""
+        for other in list(self._pending):
+            if other == stamp:
+                break
+            del self._pending[other]
+            self._close(other, "older than the episode, stamp")
 
     def missing(self) -> dict[int, set[str]]:
-        """Names still awaited, per incomplete stamp."""
+        """Names still awaited, per incomplete stamp, in the order in which the sets began."""
         return {stamp: set(self._names - values.keys()) for stamp, values in self._pending.items()}
+
+    def _drop(self, stamp: int) -> None:
+        absent = sorted(self._names - self._pending.pop(stamp).keys())
+        self._close(stamp, "stale stamp")
+        self._on_loss(stamp, absent)
+
+    def _close(self, stamp: int, reason: str) -> None:
+        self._over[stamp] = reason
+        if len(self._over) > _REMEMBERED:
+            del self._over[next(iter(self._over))]

@@ -7,7 +7,6 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, PointCloud2
 
 from active6d_core.camera import PinholeCamera
@@ -16,7 +15,6 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
-    OutdatedError,
     hypotheses_from_cloud,
     image_to_segmentation,
     objects_to_cloud,
@@ -26,6 +24,7 @@ from active6d_core.ros.conversions import (
     require_frame,
     stamp_to_ns,
 )
+from active6d_core.ros.episode_messages import EpisodeStart
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.optional_outputs import DetectionOutput
@@ -58,11 +57,9 @@ class HypothesisFusionNode(GraphNode):
         self._markers = self.output(topics.OBJECTS_MARKERS)
         self._unexplained = self.output(topics.UNEXPLAINED)
         self._detections = DetectionOutput(self)
-        # First, for the executor calls back in this order: a new episode is known before its first view.
-        self.input(topics.EPISODE_START, self._on_episode_start)
         self.input(topics.HYPOTHESES, self._on_hypotheses)
         self.input(topics.SEGMENTATION, self._on_segmentation)
-        self._inputs = ViewInputs(self, ("depth", "camera", "pose"), self._on_view, _OTHERS)
+        self._inputs = ViewInputs(self, ("depth", "camera", "pose"), self._on_view, _OTHERS, self._on_start)
 
     def _declare_fusion(self) -> None:
         usual = FusionParameters()
@@ -119,7 +116,6 @@ class HypothesisFusionNode(GraphNode):
     def setup(self) -> None:
         """Load the object and precompute its views; nothing is known of any view."""
         self._latest: tuple[int, np.ndarray, PinholeCamera] | None = None
-        self._episode_start = 0
         self._inputs.reset()
         self._model = load_object(self.value("object"))
         parameters = FusionParameters(**{each.name: self.value(each.name) for each in fields(FusionParameters)})
@@ -158,16 +154,18 @@ class HypothesisFusionNode(GraphNode):
         if self._latest is None or stamp != self._latest[0]:
             self._inputs.add("segmentation", stamp, image_to_segmentation(message))
 
-    def _on_episode_start(self, message: DiagnosticArray) -> None:
-        start = self._episode_start = stamp_to_ns(message.header.stamp)
-        self._fusion.forget_before(start)
-        self._surface.forget_before(start)
-        if self._latest is not None and self._latest[0] >= start:
+    def _on_start(self, start: EpisodeStart, new: bool) -> None:
+        if new:
+            self._fusion.reset()
+            self._surface.reset()
+            self._latest = None
+            return
+        self._fusion.forget_before(start.stamp)
+        self._surface.forget_before(start.stamp)
+        if self._latest is not None:
             self._publish(*self._latest)  # the first view overtook the announcement of its episode
 
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
-        if stamp < self._episode_start:  # the estimator was still busy with it when the scene changed
-            raise OutdatedError(f"view of {stamp * 1e-9:.3f} s is older than the episode")
         hypotheses = hypotheses_from_cloud(values["hypotheses"], values["segmentation"], self.camera_frame)
         with self.measure(stamp) as summary:
             verification = self._verifier.score(values["depth"], values["camera"], hypotheses)

@@ -190,7 +190,7 @@ class SceneFusion:
 
     def reset(self) -> None:
         """Forget all views."""
-        self._stamps: set[int] = set()
+        self._stamps: list[int] = []
         self._stamp = np.zeros(0, np.int64)
         self._T_world_object = np.zeros((0, 4, 4))
         # Columns: verification, score, box (4), depth.
@@ -198,9 +198,10 @@ class SceneFusion:
         self._distances = np.zeros((0, 0))
 
     def forget_before(self, stamp: int) -> None:
-        """Forget all views older than ``stamp`` (nanoseconds)."""
-        kept = self._stamp >= stamp
-        self._stamps = {known for known in self._stamps if known >= stamp}
+        """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
+        first = self._stamps.index(stamp) if stamp in self._stamps else len(self._stamps)
+        self._stamps = self._stamps[first:]
+        kept = np.isin(self._stamp, self._stamps)
         self._stamp, self._table = self._stamp[kept], self._table[kept]
         self._T_world_object = self._T_world_object[kept]
         self._distances = self._distances[np.ix_(kept, kept)]
@@ -235,7 +236,7 @@ class SceneFusion:
         distances[:known, known:] = distances[known:, :known].T
         self._distances = distances
         row = np.column_stack([verification, hypotheses.score, hypotheses.box, hypotheses.depth])
-        self._stamps.add(stamp)
+        self._stamps.append(stamp)
         self._stamp = np.append(self._stamp, np.full(len(T), stamp))
         self._table = np.concatenate([self._table, row])
         return True

@@ -233,8 +233,10 @@ class ObservedSurface:
         self._seen[stamp] = self.grid.observe(depth, camera, T_world_camera)
 
     def forget_before(self, stamp: int) -> None:
-        """Forget all views older than ``stamp`` (nanoseconds)."""
-        self._seen = {known: seen for known, seen in self._seen.items() if known >= stamp}
+        """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
+        known = list(self._seen)
+        first = known.index(stamp) if stamp in self._seen else len(known)
+        self._seen = {each: self._seen[each] for each in known[first:]}
 
     def unexplained(self, T_world_object: np.ndarray) -> np.ndarray:
         """(k, 3) centres of the unexplained cells: seen, and not near any of (n, 4, 4) poses; world, metres."""
