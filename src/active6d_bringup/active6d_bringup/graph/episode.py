@@ -254,7 +254,7 @@ def _spin_to_end(
         if interrupted.is_set():
             raise EpisodeInterrupted
         awaited = monitor.missing()
-        unrecorded = [] if awaited else graph.missing(monitor.end_stamp)
+        unrecorded = [] if awaited else graph.missing(monitor.end_stamp or 0)
         if not awaited and not unrecorded:
             return
         if progress != (monitor.received, monitor.end_stamp):
