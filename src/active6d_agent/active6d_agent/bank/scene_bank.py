@@ -114,10 +114,11 @@ def observe_scene(
         views.append(np.full(len(hypotheses), index))
         entropy.append(view_entropy(hypotheses.segmentation))
         surface.append(np.packbits(grid.observe(view.depth, view.camera, view.T_world_camera)))
-    view, table = np.concatenate(views), np.concatenate(tables)
-    errors = e_add(model, world_poses(table, view, sphere)[:, None], T_world_object[None], cutoff=MISSED_E_ADD)
+    of_view, table = np.concatenate(views), np.concatenate(tables)
+    errors = e_add(model, world_poses(table, of_view, sphere)[:, None], T_world_object[None], cutoff=MISSED_E_ADD)
     errors[errors >= MISSED_E_ADD] = np.inf
-    return BankScene(name, T_world_object, view, table, errors.astype(np.float32), np.array(entropy), np.stack(surface))
+    errors = errors.astype(np.float32)
+    return BankScene(name, T_world_object, of_view, table, errors, np.array(entropy), np.stack(surface))
 
 
 def view_entropy(segmentation: np.ndarray) -> float:

@@ -30,6 +30,18 @@ def make_spaces(steps: int) -> tuple[spaces.Dict, spaces.Box]:
     return observation, spaces.Box(low, high)
 
 
+def horizon(observations: spaces.Space[Any]) -> int:
+    """T of an observation space of :func:`make_spaces`.
+
+    Raises:
+        ValueError: it is another space.
+    """
+    history = observations["history"] if isinstance(observations, spaces.Dict) else None
+    if history is None or not history.shape:
+        raise ValueError("this is not an observation space of Active6D-v0")
+    return history.shape[0]
+
+
 class Active6DEnv(gym.Env):
     """One episode is T moves in one scene; observations and scores are looked up in a bank.
 

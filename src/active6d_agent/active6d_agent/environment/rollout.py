@@ -39,6 +39,11 @@ class EpisodeResults:
         """The paper's three measures by name, (E,) each."""
         return {name: getattr(self, name) for name in MEASURES}
 
+    @property
+    def means(self) -> tuple[float, float, float]:
+        """Mean detection rate, mean e_ADD (mm) and mean distance (m)."""
+        return float(self.detection_rate.mean()), float(self.e_add_mm.mean()), float(self.distance_m.mean())
+
 
 def roll_out(
     lookup: BatchedFusion,

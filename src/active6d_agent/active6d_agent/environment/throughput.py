@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from active6d_agent.environment.gym_environment import Active6DVectorEnv
+from active6d_agent.environment.gym_environment import Active6DVectorEnv, make_spaces
 
 
 def measure_steps_per_second(
@@ -33,10 +33,10 @@ def measure_steps_per_second(
 def _run(bank: Path, environments: int, seconds: float, steps: int, seed: int) -> float:
     env, rng = Active6DVectorEnv(bank, environments, steps=steps), np.random.default_rng(seed)
     env.reset(seed=seed)
-    low, high = env.single_action_space.low, env.single_action_space.high
+    actions = make_spaces(steps)[1]
     env.episodes.lookup.project_everything()
     moves, started = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - started) < seconds:
-        env.step(rng.uniform(low, high, (environments, 3)))
+        env.step(rng.uniform(actions.low, actions.high, (environments, 3)))
         moves += environments
     return moves / elapsed

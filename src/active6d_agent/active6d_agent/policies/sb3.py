@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-from active6d_agent.environment.gym_environment import make_spaces
+from active6d_agent.environment.gym_environment import horizon, make_spaces
 from active6d_agent.policies.attention.encoding import decode
 from active6d_agent.policies.attention.network import encode_observations
 from active6d_agent.policies.policy_weights import load_weights, save_weights
@@ -38,9 +38,9 @@ def export_model(model: BaseAlgorithm, path: Path) -> None:
     """
     config = {
         "algorithm": type(model).__name__,
-        "steps": model.observation_space["history"].shape[0],
+        "steps": horizon(model.observation_space),
         "net_arch": model.policy.net_arch,
-        "activation": model.policy.activation_fn.__name__,
+        "activation": getattr(model.policy.activation_fn, "__name__", ""),
     }
     try:
         shapes = {name: value.shape for name, value in _build(config).state_dict().items()}
@@ -74,7 +74,7 @@ class Sb3Policy:
 
     def __init__(self, model: ObjectModel, weights: str) -> None:
         self._policy = load_weights(Path(weights), "sb3", _build, _REMEDY)
-        self._steps = self._policy.observation_space["history"].shape[0]
+        self._steps = horizon(self._policy.observation_space)
 
     def reset(self, rng: np.random.Generator) -> None:
         """Nothing is random here."""

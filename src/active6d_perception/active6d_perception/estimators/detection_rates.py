@@ -110,13 +110,12 @@ def _objects(views: Sequence[ViewResult]) -> int:
 def _precision_over_recall(views: Sequence[ViewResult], error: str, limit: float) -> tuple[np.ndarray, np.ndarray]:
     """Recall and monotone precision after each of the hypotheses of all views, best first."""
     order = np.argsort(-np.concatenate([view.score for view in views]), kind="stable")
-    counted, right = [], []
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
     for view in views:
         hidden = view.visible_fraction < LEAST_VISIBLE
         matched = view.match(error, limit, hidden.astype(int))
-        counted.append(~np.append(hidden, False)[matched])  # -1, no match, indexes the last entry
-        right.append(matched >= 0)
-    counted, right = np.concatenate(counted)[order], np.concatenate(right)[order]
+        parts.append((~np.append(hidden, False)[matched], matched >= 0))  # -1, no match, indexes the last entry
+    counted, right = (np.concatenate(part)[order] for part in zip(*parts, strict=True))
     hits = np.cumsum(right[counted])
     precision = np.maximum.accumulate((hits / np.arange(1, len(hits) + 1))[::-1])[::-1]
     return hits / _objects(views), precision

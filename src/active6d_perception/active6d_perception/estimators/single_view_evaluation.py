@@ -217,7 +217,7 @@ def detection_over_views(
         (e, v) share of the scene's true objects detected (one to one, ADD below 10 % of the diameter).
     """
     verifier = Verifier(model)
-    rates = []
+    rates: list[list[float]] = []
     for episode in episodes:
         fusion = SceneFusion(model, parameters)
         rates.append([])

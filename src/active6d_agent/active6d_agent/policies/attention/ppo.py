@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import nn
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.environment.episodes import RewardParameters
-from active6d_agent.environment.gym_environment import Active6DVectorEnv
+from active6d_agent.environment.gym_environment import Active6DVectorEnv, horizon
 from active6d_agent.environment.rollout import measure, roll_out
 from active6d_agent.evaluation.policy_evaluation import all_starts
 from active6d_agent.policies.attention.encoding import decode
@@ -139,7 +139,7 @@ class AttentionExtractor(BaseFeaturesExtractor):
     """The state s_t; remembers the index that the attention chose last, which is part of the action."""
 
     def __init__(self, observation_space: spaces.Dict, rule: str = "learned") -> None:
-        self.steps = observation_space["history"].shape[0]
+        self.steps = horizon(observation_space)
         super().__init__(observation_space, 15 + 3 * self.steps)
         self.attention = ObjectAttention(rule)
         self.attended = torch.zeros(0, dtype=torch.long)
@@ -170,9 +170,9 @@ class PaperPolicy(ActorCriticPolicy):
         super().__init__(observation_space, angles, lr_schedule, **{**keywords, **settings})
         self.action_space = action_space
 
-    def forward(
-        self, obs: dict[str, torch.Tensor], deterministic: bool = False
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    features_extractor: AttentionExtractor
+
+    def forward(self, obs: Any, deterministic: bool = False) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Actions (B, 3), values (B, 1) and log probabilities (B,)."""
         latent_pi, latent_vf = self.mlp_extractor(self.extract_features(obs))
         distribution = self._get_action_dist_from_latent(latent_pi)
@@ -180,12 +180,12 @@ class PaperPolicy(ActorCriticPolicy):
         return self._with_index(angles), self.value_net(latent_vf), distribution.log_prob(angles)
 
     def evaluate_actions(
-        self, obs: dict[str, torch.Tensor], actions: torch.Tensor
+        self, obs: Any, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
         """Values, log probabilities and entropies of (B, 3) actions, of which only the angles count."""
         return super().evaluate_actions(obs, actions[:, :2])
 
-    def _predict(self, observation: dict[str, torch.Tensor], deterministic: bool = False) -> torch.Tensor:
+    def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
         angles = self.get_distribution(observation).get_actions(deterministic=deterministic)
         return self._with_index(angles)
 
@@ -262,7 +262,7 @@ def train_ppo(
     while ppo.num_timesteps < parameters.total:
         chunk = min(parameters.evaluate_every, parameters.total - ppo.num_timesteps)
         ppo.learn(chunk, reset_num_timesteps=False, progress_bar=False)
-        network = ppo.policy.network()
+        network = cast(PaperPolicy, ppo.policy).network()
         measured = validate(network, validation, parameters.steps)
         returns = [episode["r"] for episode in ppo.ep_info_buffer or []]
         mean_return = float(np.mean(returns)) if returns else float("nan")
@@ -303,7 +303,7 @@ def validate(network: AttentionNetwork, lookup: BatchedFusion, steps: int) -> tu
         return decode(mean.double().clamp(-1.0, 1.0).numpy(), lookup.sphere, candidates)
 
     views = roll_out(lookup, choose, starts[:, 0], starts[:, 1], np.full(len(starts), steps))
-    return tuple(float(values.mean()) for values in measure(lookup, starts[:, 0], views).measures.values())
+    return measure(lookup, starts[:, 0], views).means
 
 
 def _checkpoint(ppo: PPO, folder: Path, state: dict) -> None:
@@ -336,5 +336,5 @@ def _restore(ppo: PPO, folder: Path, identity: dict) -> tuple[tuple[float, float
     ppo.policy.optimizer.load_state_dict({**ppo.policy.optimizer.state_dict(), "state": adam})
     ppo.num_timesteps = int(state["steps"])
     # The seed alone would draw the same scenes again.
-    ppo.set_random_seed(ppo.seed + ppo.num_timesteps)
+    ppo.set_random_seed((ppo.seed or 0) + ppo.num_timesteps)
     return tuple(state["best"]), float(state["seconds"])

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -232,7 +233,7 @@ def validate(
     """Detection rate, e_ADD (mm) and metres of the network's moves from (E, 2) starts."""
     moves = np.full(len(starts), steps)
     views = roll_out(lookup, greedy(network, lookup.model), starts[:, 0], starts[:, 1], moves)
-    return tuple(float(values.mean()) for values in measure(lookup, starts[:, 0], views).measures.values())
+    return measure(lookup, starts[:, 0], views).means
 
 
 def greedy(network: ViewAttention, model: ObjectModel) -> Choose:
@@ -330,7 +331,7 @@ class _Learner:
         self._schedule = CosineAnnealingLR(self.optimizer, parameters.rounds, lowest)
         # The running mean of the weights makes the moves and is stored: it does better on other scenes than the latest.
         self._average = AveragedModel(self._trained, avg_fn=_running_mean).eval()
-        self.network: ViewAttention = self._average.module
+        self.network = cast(ViewAttention, self._average.module)
         self.network.weighing = weighing
         self.rng = np.random.default_rng(parameters.seed)
         self.memory: deque[Example] = deque(maxlen=parameters.capacity)
@@ -411,9 +412,9 @@ class _Learner:
         return float(loss.detach())
 
 
-def _running_mean(mean: torch.Tensor, value: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+def _running_mean(mean: torch.Tensor, value: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:
     """Exponential moving average; at first over fewer steps, so that the initial weights do not count."""
-    return torch.lerp(value, mean, torch.clamp((1 + count) / (10 + count), max=_MEAN_DECAY))
+    return torch.lerp(value, mean, torch.as_tensor((1 + count) / (10 + count)).clamp(max=_MEAN_DECAY))
 
 
 def _labels(gains: list[np.ndarray], views: np.ndarray, count: int) -> np.ndarray:

@@ -271,12 +271,10 @@ class ViewAttentionPolicy:
         written = path.stat().st_mtime_ns if path.is_file() else 0
         self._network, weighing = _deployed(path, model, written)
         given = {"metres_weight": metres_weight, "error_weight": error_weight, "lookahead": lookahead}
-        given = {name: value for name, value in given.items() if value is not None}
-        self._model, self._weighing = model, replace(weighing, **given)
-        self._stop_below = stop_below
-        measured = {"width": bin_width, "wall_height": wall_height}
-        measured = {name: value for name, value in measured.items() if value is not None}
-        self._tray = Tray.for_model(model)._replace(**measured)
+        self._model, self._stop_below = model, stop_below
+        self._weighing = replace(weighing, **{name: value for name, value in given.items() if value is not None})
+        sizes = {"width": bin_width, "wall_height": wall_height}
+        self._tray = Tray.for_model(model)._replace(**{name: size for name, size in sizes.items() if size is not None})
         if not (0 < self._tray.width < np.inf and 0 <= self._tray.wall_height < np.inf):
             raise ValueError(f"bin_width must be positive and wall_height not negative, got {self._tray}")
 

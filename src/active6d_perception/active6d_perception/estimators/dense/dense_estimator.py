@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -37,6 +38,8 @@ from active6d_perception.estimators.registry import register_estimator, weights_
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.suppression import suppress
+
+_Result = TypeVar("_Result")
 
 # Rotations about the axis this close to the chosen one count towards its certainty.
 _SAME_ROTATION = np.radians(30.0)
@@ -140,7 +143,8 @@ class DenseEstimator:
         self.certainty = np.zeros(0)
         self._trained = trained
         self._precision = torch.bfloat16 if has_fast_bfloat16() else torch.float32
-        self._network = fused(trained.network).to(dtype=self._precision, memory_format=torch.channels_last)
+        network: Any = fused(trained.network)  # torch's hints do not know the memory format of a module
+        self._network = network.to(dtype=self._precision, memory_format=torch.channels_last)
         self._views = model_views(model)
         self._distance = SymmetricDistance(model)
         shown = trained.canonical_frame.axis_rotation
@@ -229,6 +233,7 @@ class DenseEstimator:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As :meth:`_find_poses`, where the whole surface shows the orientation: the best fitting of several."""
         count = len(instances)
+        assert self._orientations is not None, "made where the whole surface shows the orientation"
         T = self._orientations.candidates(instances, surface, _TRIED_ORIENTATIONS[0][0])
         for number, gates in _TRIED_ORIENTATIONS:
             T = self._refined(T[:, :number].reshape(-1, 4, 4), surface, gates, iterations=2, samples=64)
@@ -239,6 +244,7 @@ class DenseEstimator:
 
     def _axis_rotation_probability(self, T: np.ndarray, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
         """(n, len(AXIS_ANGLES)) posterior of the rotation about the axis, from network and depth image."""
+        assert self._axis_rotations is not None, "made where a part shows the rotation"
         measured = self._axis_rotations.log_likelihood(T, surface)
         predicted = _NETWORK_TRUST * np.log(axis_rotation_probability(T, instances.direction) + 1e-6)
         return softmax(measured + predicted, axis=1)
@@ -302,7 +308,7 @@ class DenseEstimator:
         origin = (poses.T_camera_object @ self._trained.canonical_frame.T_object_axis)[:, :3, 3]
         return np.linalg.norm(origin[:, None] - origin, axis=-1)
 
-    def _timed(self, stage: str, function: Callable, *arguments):
+    def _timed(self, stage: str, function: Callable[..., _Result], *arguments: Any) -> _Result:
         start = perf_counter()
         result = function(*arguments)
         self.stage_ms[stage] = 1e3 * (perf_counter() - start)

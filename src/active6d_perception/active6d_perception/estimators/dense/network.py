@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -107,8 +108,10 @@ def fused(network: DenseNetwork) -> DenseNetwork:
     """A copy for inference with each batch normalisation merged into the convolution before it."""
     network = deepcopy(network).eval()
     for module in list(network.modules()):
-        if isinstance(module, nn.Sequential) and len(module) > 1 and isinstance(module[1], nn.BatchNorm2d):
-            module[0], module[1] = fuse_conv_bn_eval(module[0], module[1]), nn.Identity()
+        if isinstance(module, nn.Sequential):
+            match list(module):
+                case [nn.Conv2d() as convolution, nn.BatchNorm2d() as normalisation, *_]:
+                    module[0], module[1] = fuse_conv_bn_eval(convolution, normalisation), nn.Identity()
     return network
 
 
@@ -120,7 +123,7 @@ def has_fast_bfloat16(device: str = "cpu") -> bool:
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
 
-def split(answer, axis: int = 1) -> dict:
+def split(answer: Any, axis: int = 1) -> dict[str, Any]:
     """The network's output by head: views of a torch tensor or NumPy array, cut along ``axis``.
 
     Raises:

@@ -36,9 +36,9 @@ class VisibleSamples(NamedTuple):
     """(s, 3) float32 object frame, metres"""
     normals: np.ndarray
     """(s, 3) float32"""
-    index: np.ndarray
+    visible: np.ndarray
     """(m, c) samples visible from a direction"""
-    count: np.ndarray
+    counts: np.ndarray
     """(m,) how many of the c are used"""
     directions: np.ndarray
     """(m, 3) unit vectors from the object to the eye, object frame"""
@@ -97,8 +97,8 @@ def compare(T: np.ndarray, samples: VisibleSamples, image: MeasuredImage, tolera
         P = T[k]
         direction = _nearest_direction(P, samples.directions)
         used, fitting, violated, occluded = 0, 0.0, 0, 0
-        for place in range(samples.count[direction]):
-            s = samples.index[direction, place]
+        for place in range(samples.counts[direction]):
+            s = samples.visible[direction, place]
             a, b, c = samples.points[s, 0], samples.points[s, 1], samples.points[s, 2]
             z = P[2, 0] * a + P[2, 1] * b + P[2, 2] * c + P[2, 3]
             if z < 1e-3:
@@ -129,7 +129,7 @@ def compare(T: np.ndarray, samples: VisibleSamples, image: MeasuredImage, tolera
                     off = behind / tolerance
                     fitting += (1.0 - off * off) * min(1.0, (cosine - alike) / (0.95 - alike))
         # Half of the samples without a measurement are no evidence; fewer measured ones count as half.
-        total = max(used, samples.count[direction] // 2, 1)
+        total = max(used, samples.counts[direction] // 2, 1)
         result[k, 0], result[k, 1], result[k, 2] = fitting / total, violated / total, occluded / total
     return result
 
@@ -184,8 +184,8 @@ def _add_pairs(
     """Add the upper half of the normal equations of one (4, 4) pose to (6, 6) ``A`` and (6,) ``g``; number of pairs."""
     height, width = image.points.shape[:2]
     pairs = 0
-    for place in range(samples.count[direction]):
-        s = samples.index[direction, place]
+    for place in range(samples.counts[direction]):
+        s = samples.visible[direction, place]
         a, b, c = samples.points[s, 0], samples.points[s, 1], samples.points[s, 2]
         # arm from the object's origin, and the sample itself
         ax = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c

@@ -74,14 +74,13 @@ class PairVoting:
         cells = len(self._reference_frames) * _ROTATION_BINS
         index = (row[pair] * cells).astype(np.int64) + self._pair_reference[model_pair] * _ROTATION_BINS + rotation_bin
         votes = np.bincount(index, minlength=len(references) * cells).reshape(len(references), -1, _ROTATION_BINS)
-        votes = votes + 0.5 * (np.roll(votes, 1, axis=2) + np.roll(votes, -1, axis=2))
-        votes = votes.reshape(len(references), -1)
-        best = np.argpartition(votes, -peaks, axis=1)[:, -peaks:]
+        smooth = (votes + 0.5 * (np.roll(votes, 1, axis=2) + np.roll(votes, -1, axis=2))).reshape(len(references), -1)
+        best = np.argpartition(smooth, -peaks, axis=1)[:, -peaks:]
         reference, rotation_bin = np.divmod(best.ravel(), _ROTATION_BINS)
         angle = (rotation_bin + 0.5) * (2 * np.pi / _ROTATION_BINS)
         about_normal = make_transform(Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 0.0]).as_matrix(), np.zeros(3))
         poses = np.repeat(invert(frames), peaks, axis=0) @ about_normal @ self._reference_frames[reference]
-        return poses, np.take_along_axis(votes, best, axis=1).ravel()
+        return poses, np.take_along_axis(smooth, best, axis=1).ravel()
 
     def _features(
         self, p1: np.ndarray, n1: np.ndarray, p2: np.ndarray, n2: np.ndarray

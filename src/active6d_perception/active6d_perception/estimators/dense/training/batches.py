@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from active6d_core.camera import View
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import CanonicalFrame
 from active6d_perception.estimators.dense.network_input import network_input, pad
@@ -58,7 +59,7 @@ class TrainingViews(IterableDataset):
         return input_tensor(view, self._diameter), make_targets(sample, self._canonical_frame, self._diameter)
 
 
-def input_tensor(view, diameter: float) -> Tensor:
+def input_tensor(view: View, diameter: float) -> Tensor:
     """The padded (channels, h, w) input of one view at the network's resolution."""
     return torch.from_numpy(pad(network_input(view, diameter)))
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 _RATES = {
     "add_half": "e_ADD, half visible",
@@ -23,7 +24,8 @@ def draw_curves(history: Sequence[dict[str, float]], path: Path, title: str) -> 
     from matplotlib.figure import Figure  # slow to import, and not needed without a validation
 
     figure = Figure(figsize=(11, 7), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(3, 4))
+    subfigures: Any = figure.subfigures(2, 1, height_ratios=(3, 4))
+    above, below = subfigures
     rates = above.subplots()
     steps = [entry["step"] for entry in history]
     for key, label in _RATES.items():

@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -167,8 +168,8 @@ class _Run:
     def __init__(self, folder: Path, options: TrainingOptions, device: str) -> None:
         torch.manual_seed(options.seed)
         self._options, self._device = options, torch.device(device)
-        network = DenseNetwork(options.size, HEADS if options.loss.coordinates else DEPLOYED_HEADS)
-        self._network = network.to(self._device, memory_format=torch.channels_last).train()
+        network: Any = DenseNetwork(options.size, HEADS if options.loss.coordinates else DEPLOYED_HEADS)
+        self._network: DenseNetwork = network.to(self._device, memory_format=torch.channels_last).train()
         self._averaged = AveragedModel(self._network, avg_fn=partial(_average, options.averaging), use_buffers=True)
         # The scheduler reads the initial rate from here when it goes on with a training.
         groups = [{"params": list(self._network.parameters()), "initial_lr": options.learning_rate}]
@@ -200,7 +201,7 @@ class _Run:
 
     def averaged_on_cpu(self) -> DenseNetwork:
         """A copy of the averaged network."""
-        return deepcopy(self._averaged.module).cpu().eval()
+        return cast(DenseNetwork, deepcopy(self._averaged.module).cpu().eval())
 
     def save(self) -> None:
         """Write tensors and history; the previous state stays if the writing is interrupted."""

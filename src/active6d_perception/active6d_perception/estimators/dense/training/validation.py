@@ -46,7 +46,8 @@ def pose_rates(
     """
     estimator = DenseEstimator(model, trained, parameters)
     limit = DETECTION_FRACTION * model.diameter
-    found, visible, right, reported = {"add": [], "adds": []}, [], 0, 0
+    found: dict[str, list[np.ndarray]] = {"add": [], "adds": []}
+    visible, right, reported = [], 0, 0
     for sample in samples:
         T = estimator.locate(sample.view)[0].T_camera_object
         errors = {
