@@ -19,11 +19,20 @@ setup(
         *((f"share/{package}/{folder}", glob(f"{folder}/*")) for folder in ("launch", "config", "rviz", "foxglove")),
     ],
     python_requires=">=3.11",
-    install_requires=["active6d_agent", "active6d_core", "active6d_perception", "numpy", "pyyaml", "rosbags"],
+    install_requires=[
+        "active6d_agent",
+        "active6d_core",
+        "active6d_perception",
+        "numpy",
+        "opencv-contrib-python-headless",
+        "pyyaml",
+        "rosbags",
+    ],
     entry_points={
         "console_scripts": [
             "episode_recorder = active6d_bringup.nodes.episode_recorder:main",
             "bag_player = active6d_bringup.nodes.bag_player:main",
+            "camera_adapter = active6d_bringup.nodes.camera_adapter:main",
         ]
     },
 )

@@ -18,6 +18,7 @@ setup(
     python_requires=">=3.11",
     install_requires=[
         "numpy",
+        "pillow",
         "pyyaml",
         "scipy",
         "trimesh",

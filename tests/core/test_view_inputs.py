@@ -129,7 +129,7 @@ def test_a_bad_transform_is_refused_and_the_node_lives(graph, buffers):
 
 def test_without_tf2_the_parameter_is_refused(graph, monkeypatch):
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
-    with pytest.raises(ValueError, match="viewer: parameter 'pose_source' is 'tf', but tf2_ros is not installed"):
+    with pytest.raises(ValueError, match="viewer: poses from /tf need tf2_ros, which is not installed"):
         Viewer(context=graph.context, overrides={"pose_source": "tf"})
 
 

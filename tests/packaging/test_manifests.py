@@ -20,6 +20,7 @@ ROS = set(
 # import: (rosdep key, None where there is none that is new enough and without CUDA; name on PyPI)
 LIBRARIES = {
     "PIL": ("python3-pil", "pillow"),
+    "cv2": ("python3-opencv", "opencv-contrib-python-headless"),
     "contourpy": ("python3-matplotlib", "matplotlib"),
     "gymnasium": ("python3-gymnasium-pip", "gymnasium"),
     "jinja2": ("python3-jinja2", "jinja2"),

@@ -23,8 +23,8 @@ ARGUMENTS = {
     "namespace": ("", None, "prefix of every node and topic"),
     "camera": (
         "simulator",
-        ["simulator", "dataset", "bag", "none"],
-        "source of the camera topics; none: your driver",
+        ["simulator", "dataset", "bag", "adapter", "none"],
+        "source of the camera topics; adapter: your driver, through camera_adapter; none: your driver as it is",
     ),
     "object": ("", None, "object that fills the bin; empty: as in params_file"),
     "seed": ("", None, "seed of the pile, the sensor noise and the policy; empty: as in params_file"),
@@ -42,7 +42,13 @@ ARGUMENTS = {
     "rviz": ("false", ["true", "false"], "show the graph in RViz"),
 }
 
-CAMERAS = {"simulator": ["camera_simulator"], "dataset": ["dataset_camera"], "bag": ["bag_player"], "none": []}
+CAMERAS = {
+    "simulator": ["camera_simulator"],
+    "dataset": ["dataset_camera"],
+    "bag": ["bag_player"],
+    "adapter": ["camera_adapter"],
+    "none": [],
+}
 TYPES = {
     "seed": int,
     "steps": int,

@@ -18,6 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from active6d_core.calibration import Calibration
 from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
@@ -182,7 +183,7 @@ def image_to_color(message: Image) -> np.ndarray:
     channels = _COLOR_CHANNELS.get(message.encoding)
     if channels is None:
         raise MessageError(f"color encoding '{message.encoding}' is not one of {', '.join(_COLOR_CHANNELS)}")
-    pixels = _image_to_array(message, np.dtype("u1"), 4 if message.encoding.endswith("a8") else 3)
+    pixels = image_to_pixels(message, np.dtype("u1"), 4 if message.encoding.endswith("a8") else 3)
     return pixels if message.encoding == "rgb8" else np.ascontiguousarray(pixels[..., channels])
 
 
@@ -198,11 +199,11 @@ def image_to_depth(message: Image) -> np.ndarray:
         MessageError: another encoding, or sizes that disagree.
     """
     if message.encoding == "32FC1":
-        depth = _image_to_array(message, np.dtype("<f4"), 1)
+        depth = image_to_pixels(message, np.dtype("<f4"), 1)
         valid = (depth > 0) & (depth < np.inf)
         return depth if valid.all() else np.where(valid, depth, np.float32(np.nan))
     if message.encoding == "16UC1":
-        millimetres = _image_to_array(message, np.dtype("<u2"), 1)
+        millimetres = image_to_pixels(message, np.dtype("<u2"), 1)
         return np.where(millimetres > 0, millimetres * np.float32(0.001), np.float32(np.nan))
     raise MessageError(f"depth encoding '{message.encoding}' is not 32FC1 or 16UC1")
 
@@ -220,7 +221,7 @@ def image_to_segmentation(message: Image) -> np.ndarray:
     """
     if message.encoding != "mono16":
         raise MessageError(f"segmentation encoding '{message.encoding}' is not mono16")
-    return _image_to_array(message, np.dtype("<u2"), 1)
+    return image_to_pixels(message, np.dtype("<u2"), 1)
 
 
 def _array_to_image(pixels: np.ndarray, encoding: str, stamp: int, frame: str) -> Image:
@@ -238,19 +239,31 @@ def _bytes_of(values: np.ndarray) -> "array[int]":
     return data
 
 
-def _image_to_array(message: Image, dtype: np.dtype, channels: int) -> np.ndarray:
+def image_to_pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
+    """The pixels of an Image without its padding, in this machine's byte order.
+
+    Args:
+        message: the Image.
+        dtype: of its numbers.
+        channels: numbers per pixel.
+
+    Returns:
+        (H, W), or (H, W, channels) for more than one channel.
+
+    Raises:
+        MessageError: the message's sizes disagree.
+    """
     height, width, step = message.height, message.width, message.step
     row_bytes = width * channels * dtype.itemsize
     if height == 0 or width == 0:
         raise MessageError(f"image is empty ({width}x{height})")
-    if message.is_bigendian and dtype.itemsize > 1:
-        raise MessageError("big-endian images are not supported")
     if step < row_bytes or len(message.data) != step * height:
         raise MessageError(
             f"{message.encoding} image of {width}x{height} has step {step} and {len(message.data)} bytes of data"
         )
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, :row_bytes]
-    pixels = np.ascontiguousarray(rows).view(dtype)
+    pixels = np.ascontiguousarray(rows).view(dtype.newbyteorder(">" if message.is_bigendian else "<"))
+    pixels = pixels.astype(dtype.newbyteorder("="), copy=False)
     return pixels.reshape(height, width, channels) if channels > 1 else pixels.reshape(height, width)
 
 
@@ -269,18 +282,23 @@ def camera_to_info(camera: PinholeCamera, stamp: int, frame: str) -> CameraInfo:
 
 
 def info_to_camera(message: CameraInfo) -> PinholeCamera:
-    """A CameraInfo of a rectified camera to intrinsics.
+    """A CameraInfo of a rectified camera to the intrinsics of its images, region and binning included.
+
+    P counts, as it does for rectified images; K only where a driver leaves P empty.
 
     Raises:
         MessageError: the image is not rectified, or the numbers make no camera.
     """
-    if np.any(message.d):
-        raise MessageError("camera_info has distortion; publish rectified images (image_proc) with d = 0")
-    k = np.asarray(message.k, float).reshape(3, 3)
     try:
-        return PinholeCamera(int(message.width), int(message.height), *map(float, (k[0, 0], k[1, 1], k[0, 2], k[1, 2])))
+        calibration = Calibration.from_info(message)
+        if calibration.distorted:
+            raise MessageError(
+                "camera_info has distortion; put the node camera_adapter between driver and graph, "
+                "or publish d = 0 if the images are rectified already"
+            )
+        return calibration.rectified_camera()
     except ValueError as error:
-        raise MessageError(f"camera_info: {error}") from error
+        raise error if isinstance(error, MessageError) else MessageError(f"camera_info: {error}") from error
 
 
 # Tables

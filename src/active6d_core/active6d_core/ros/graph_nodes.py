@@ -51,6 +51,7 @@ NODES = {
     ),
     "bag_player": NodeEntry("active6d_bringup.nodes.bag_player", "BagPlayerNode", ("bag", "rate")),
     "dataset_camera": NodeEntry("active6d_sim.nodes.dataset_camera", "DatasetCameraNode", ("object", "scene")),
+    "camera_adapter": NodeEntry("active6d_bringup.nodes.camera_adapter", "CameraAdapterNode", ("object",)),
     "camera_simulator": NodeEntry(
         "active6d_sim.nodes.camera_simulator", "CameraSimulatorNode", ("object", "seed", "scene")
     ),

@@ -59,6 +59,7 @@ class GraphNode(ParameterNode):
         self._views_measured = 0
         self._rejected = 0
         self._lost = 0
+        self._said: set[str] = set()
         self._last_view_at: float | None = None
         self._last_cause = ""
         self._watch = Watch(self)
@@ -73,6 +74,11 @@ class GraphNode(ParameterNode):
         self._read_frames()
         if self.value("heartbeat") > 0:
             self.wall_timer(self.value("heartbeat"), self.beat)
+
+    @property
+    def active(self) -> bool:
+        """Whether the node takes input now."""
+        return self._active
 
     # What a subclass overrides
 
@@ -165,6 +171,14 @@ class GraphNode(ParameterNode):
         text = f"lost ({self._lost} so far): {what}"
         self.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_SECONDS)
         self._diagnose(DiagnosticStatus.WARN, text, 0, {})
+
+    def say_once(self, text: str) -> bool:
+        """Log and publish a warning the first time that it is given; whether there is one (it is not empty)."""
+        if text and text not in self._said:
+            self._said.add(text)
+            self.get_logger().warning(text)
+            self._diagnose(DiagnosticStatus.WARN, text, 0, {})
+        return bool(text)
 
     def _ignore(self, reason: str) -> None:
         """Drop a message of a view that is over: a neighbour that was restarted repeats its last messages."""

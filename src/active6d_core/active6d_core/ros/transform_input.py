@@ -26,16 +26,29 @@ class TransformInput:
             tf2_ros = import_module("tf2_ros")
         except ImportError as error:
             raise ValueError(
-                f"{node.get_name()}: parameter 'pose_source' is 'tf', but tf2_ros is not installed: "
-                "install ros-jazzy-tf2-ros-py or use 'topic'"
+                f"{node.get_name()}: poses from /tf need tf2_ros, which is not installed: "
+                "install ros-jazzy-tf2-ros-py, or take them from a topic (parameter pose_source or pose_topic)"
             ) from error
         self._node = node
         self._buffer = tf2_ros.Buffer(node=node)
         self._listener = tf2_ros.TransformListener(self._buffer, node)
 
-    def request(self, stamp: int, callback: Callable[[np.ndarray], None]) -> None:
-        """Call back once with (4, 4) ``T_world_camera`` at the stamp (ns), now or as soon as /tf has it."""
-        frames = self._node.world_frame, self._node.camera_frame
+    def request(
+        self,
+        stamp: int,
+        callback: Callable[[np.ndarray], None],
+        source: str | None = None,
+        target: str | None = None,
+    ) -> None:
+        """Call back once with a (4, 4) transform at the stamp (ns), now or as soon as /tf has it.
+
+        Args:
+            stamp: nanoseconds; 0 for the latest.
+            callback: called with ``T_target_source``.
+            source: frame, None for the camera's.
+            target: frame, None for the world.
+        """
+        frames = target or self._node.world_frame, source or self._node.camera_frame
         time = Time(nanoseconds=stamp)
 
         def take() -> None:

@@ -1,0 +1,1 @@
+"""What lies between a camera driver and the graph, without ROS: rectification, registration, the choice of frames."""

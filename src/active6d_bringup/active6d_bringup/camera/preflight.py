@@ -1,0 +1,106 @@
+"""What is wrong with a camera's data, once and in words, and which setting helps."""
+
+import numpy as np
+
+from active6d_core.calibration import Calibration
+from active6d_core.rgbd import PLAUSIBLE_DEPTH
+
+#: The median depth of a bin cannot be further from the camera's distance to it than this factor.
+_SCALE_FACTOR = 3.0
+_FARTHEST_CAMERA = 20.0
+
+
+def check_depth_unit(depth: np.ndarray, distance: float | None = None) -> str:
+    """Whether depth can be metres; empty if so.
+
+    Args:
+        depth: (H, W) metres, NaN where invalid.
+        distance: metres from the camera to the bin, None where it is not known.
+    """
+    if not np.isfinite(depth).any():
+        return "depth has no valid pixel: is the lens covered, the bin out of range, or the projector off?"
+    median = float(np.nanmedian(depth))
+    low, high = PLAUSIBLE_DEPTH
+    if distance is not None and distance > low:
+        low, high = max(low, distance / _SCALE_FACTOR), min(high, distance * _SCALE_FACTOR)
+    if low <= median <= high:
+        return ""
+    measured = f"median {median:.4g} m" + (f", the bin is {distance:.2f} m away" if distance is not None else "")
+    if low <= median * 1e-3 <= high:
+        return f"depth looks like millimetres that are read as metres ({measured}): set depth_scale to 0.001"
+    for unit in (0.1, 0.01, 10.0):
+        if low <= median * unit <= high:
+            return f"depth is {1 / unit:g} times what it can be ({measured}): multiply depth_scale by {unit:g}"
+    return f"depth cannot be metres ({measured}): set depth_scale, or the pose is not the camera's"
+
+
+def check_sizes(calibration: Calibration, color: np.ndarray) -> str:
+    """Whether camera_info belongs to (H, W, 3) colour images; empty if so."""
+    size = color.shape[1], color.shape[0]
+    if calibration.image_size == size:
+        return ""
+    return (
+        f"camera_info is for {calibration.image_size[0]}x{calibration.image_size[1]} images, these are "
+        f"{size[0]}x{size[1]}: set info_topic to the camera_info of this stream"
+    )
+
+
+def check_matrices(calibration: Calibration, rectified: bool) -> str:
+    """Whether K and P of camera_info agree on undistorted images; empty if so."""
+    if rectified or calibration.distorted or not calibration.matrices_differ:
+        return ""
+    focal = f"fx {calibration.K[0, 0]:.1f} and {calibration.P[0, 0]:.1f}"
+    return f"K and P of camera_info differ ({focal}) without distortion: P is used, as for rectified images"
+
+
+def check_skew(skew: int | None, tolerance: int) -> str:
+    """Whether colour and depth come together; empty if so.
+
+    Args:
+        skew: smallest difference (ns) of stamps among the images without a partner, None where nothing is wrong.
+        tolerance: what is accepted, ns.
+    """
+    if skew is None or skew <= tolerance:
+        return ""
+    if skew > 10**9:
+        return f"stamps of colour and depth are {skew * 1e-9:.1f} s apart: their clocks differ"
+    fitting = np.ceil(skew * 1e-6 + 1.0) * 1e-3
+    return f"stamps of colour and depth differ by {skew * 1e-6:.0f} ms: set stamp_tolerance to {fitting:.3f}"
+
+
+def check_pose_stamp(nearest: int | None, stamp: int, tolerance: int) -> str:
+    """Whether there is a camera pose at an image's stamp; empty if so. All in nanoseconds."""
+    if nearest is None:
+        return "no camera pose has come"
+    difference = abs(nearest - stamp)
+    if difference <= tolerance:
+        return ""
+    if difference > 10**9:
+        return f"the nearest camera pose is {difference * 1e-9:.1f} s from the image: do both use the same clock?"
+    return (
+        f"the nearest camera pose is {difference * 1e-6:.0f} ms from the image: set pose_tolerance or publish it faster"
+    )
+
+
+def check_pose_rate(poses: int, still_seconds: float) -> str:
+    """Whether enough poses come to tell that the camera stands; ``poses`` are those of the last ``still_seconds``."""
+    if poses > 1:
+        return ""
+    return f"fewer than two camera poses in {still_seconds:g} s: publish them faster, or set still_seconds higher"
+
+
+def check_pose(T_world_camera: np.ndarray) -> str:
+    """Whether a camera pose can be one in front of a bin; empty if so."""
+    position = T_world_camera[:3, 3]
+    distance = float(np.linalg.norm(position))
+    if distance > _FARTHEST_CAMERA:
+        return f"the camera's pose is {distance:.0f} m from the world's origin: is it in millimetres?"
+    if position[2] <= 0:
+        return (
+            f"the camera is {-position[2]:.2f} m below the bin: world's z must point up, its origin is the bin's centre"
+        )
+    if T_world_camera[:3, 2] @ position > 0:
+        return (
+            "the camera looks away from the bin: is the pose that of the optical frame (z forward), and world the bin?"
+        )
+    return ""

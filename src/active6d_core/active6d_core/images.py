@@ -1,0 +1,63 @@
+"""Decoding of image files and of compressed images: one reader for data sets, the command line and messages."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+#: Bits of grey images that 16-bit files carry: cameras fill the low bits.
+_GREY_BITS = (8, 10, 12, 14, 16)
+_SIXTEEN_BIT = {"I;16", "I;16L", "I;16B", "I;16N", "I"}
+
+
+def read_color(source: Path | bytes) -> np.ndarray:
+    """An image file, or its content, as (H, W, 3) uint8 RGB.
+
+    Grey, palette, alpha, CMYK and 16-bit images are converted. A grey image of 10 to 16 bits keeps its highest eight
+    bits, counted from the smallest usual bit depth that holds its brightest pixel. Transparency is ignored.
+
+    Raises:
+        ValueError: no image, a damaged one, or one whose values have no clear meaning as colours.
+    """
+    with _open(source) as image:
+        if image.mode in _SIXTEEN_BIT:
+            grey = np.asarray(image)
+            if grey.min(initial=0) < 0 or grey.max(initial=0) >= 1 << 16:
+                raise ValueError(f"{_name(source)}: a grey image of more than 16 bits cannot be used as colours")
+            bits = next(bits for bits in _GREY_BITS if grey.max(initial=0) < 1 << bits)
+            return np.repeat((grey >> (bits - 8)).astype(np.uint8)[..., None], 3, axis=2)
+        if image.mode == "F":
+            raise ValueError(f"{_name(source)}: floating-point values cannot be used as colours; is it a depth image?")
+        # Pillow would blend a transparent palette entry; the alpha channel is dropped instead.
+        return np.asarray(image.convert("RGBA").convert("RGB") if image.mode == "P" else image.convert("RGB"))
+
+
+def read_depth(source: Path | bytes) -> np.ndarray:
+    """An image file, or its content, as (H, W) depth in the file's units: uint16, int32 or float32.
+
+    Raises:
+        ValueError: no image, a damaged one, or one with 8 bits or several channels.
+    """
+    with _open(source) as image:
+        if image.mode not in _SIXTEEN_BIT | {"F"}:
+            kind = {"L": "8-bit grey", "RGB": "colour", "RGBA": "colour", "P": "palette"}.get(image.mode, image.mode)
+            raise ValueError(f"{_name(source)}: is a {kind} image, depth needs 16-bit grey or floating point")
+        depth = np.asarray(image)
+        return depth.astype(np.uint16) if image.mode.startswith("I;16") else depth
+
+
+def _open(source: Path | bytes) -> Image.Image:
+    try:
+        image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
+        image.load()
+    except FileNotFoundError as error:
+        raise ValueError(f"{_name(source)}: no such file") from error
+    # Pillow's decoders raise many kinds of errors on damaged files, including SyntaxError.
+    except Exception as error:
+        raise ValueError(f"{_name(source)}: not a readable image ({error})") from error
+    return image
+
+
+def _name(source: Path | bytes) -> str:
+    return str(source) if isinstance(source, Path) else "compressed image"
