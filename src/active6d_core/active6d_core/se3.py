@@ -9,13 +9,12 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 
-def make_transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def make_transform(rotation: ArrayLike, translation: ArrayLike) -> np.ndarray:
     """(..., 3, 3) rotation and (..., 3) translation in metres to a (..., 4, 4) transform."""
-    rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
-    leading = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
-    T = np.zeros((*leading, 4, 4))
-    T[..., :3, :3] = rotation
-    T[..., :3, 3] = translation
+    R, t = np.asarray(rotation, float), np.asarray(translation, float)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
     T[..., 3, 3] = 1.0
     return T
 

@@ -3,7 +3,6 @@
 Run it after changing a parameter or a topic: `python -m active6d_tools.describe_nodes`
 """
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -94,9 +93,8 @@ def main() -> None:
     for name in reversed(NODES):  # from the camera on, as the data go
         node = load_node_type(name)(context=context)
         sections.append(parameter_section(name, node))
-        marked = rf"(<!-- tables of {name} -->\n).*?(<!-- end -->)"
-        tables = page_section(node)
-        page = re.sub(marked, lambda match, tables=tables: f"{match[1]}{tables}\n{match[2]}", page, flags=re.DOTALL)
+        before, marker, rest = page.partition(f"<!-- tables of {name} -->\n")
+        page = f"{before}{marker}{page_section(node)}\n<!-- end -->{rest.partition('<!-- end -->')[2]}"
         node.destroy_node()
     context.try_shutdown()
     PARAMETER_FILE.write_text(HEADER + "\n" + "\n".join(sections))

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 PIP = "pip install -r requirements.txt"
 APT_ROS = "only with an apt installation of ROS 2 Jazzy: apt install ros-jazzy-"
@@ -262,7 +263,7 @@ def _write_bag() -> str:
             writer.write(connection, 1, store.serialize_cdr(message_type(data="hello"), message_type.__msgtype__))
         with Reader(path) as reader:
             [(_, _, raw)] = reader.messages()
-            message = store.deserialize_cdr(raw, message_type.__msgtype__)
+            message: Any = store.deserialize_cdr(raw, message_type.__msgtype__)
     if message.data != "hello":
         raise ValueError("the bag gave back another message")
     return "MCAP with zstd chunks"

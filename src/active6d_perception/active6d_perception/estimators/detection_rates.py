@@ -1,6 +1,6 @@
 """Detection rates of an estimator over many views, as BOP defines them, with confidence intervals."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.stats import mannwhitneyu, spearmanr
@@ -75,7 +75,7 @@ def recalls(views: Sequence[ViewResult], error: str, diameter: float) -> tuple[n
     return found, counts
 
 
-def average_precision(views: Sequence[ViewResult], error: str, limits: Sequence[float]) -> float | None:
+def average_precision(views: Sequence[ViewResult], error: str, limits: Iterable[float]) -> float | None:
     """Mean over ``limits`` of the area under the curve of precision over recall, over the hypotheses of all views.
 
     As in BOP's task "6D detection" and in COCO: 101 recall steps and monotone precision. Objects less than a tenth

@@ -1,6 +1,7 @@
 """Plots of score quality: equation 1 against the errors, and the certainty of the rotation of hidden handles."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -95,14 +96,14 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.2f}"
 
 
-def _finish(axes) -> None:
+def _finish(axes: Any) -> None:
     axes.grid(alpha=0.3)
     legend = axes.legend(fontsize="small")
     for handle in legend.legend_handles:
         handle.set_alpha(1.0)
 
 
-def _save(figure, path: Path, title: str) -> None:
+def _save(figure: Any, path: Path, title: str) -> None:
     figure.suptitle(title)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

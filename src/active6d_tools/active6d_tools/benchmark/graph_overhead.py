@@ -111,6 +111,7 @@ def prepare_views(
     for index, position in enumerate(rng.permutation(len(sphere))[:count]):
         T_world_camera = sphere.pose(sphere.positions[position])
         image = renderer.render(T_world_camera)
+        assert image.color is not None, "shaded by default"
         stamp = (index + 1) * _SECOND
         noise = rng.normal(0.0, 0.001, image.depth.shape).astype(np.float32)
         views.append(View(stamp, image.color, image.depth + noise, DEFAULT_CAMERA, T_world_camera))

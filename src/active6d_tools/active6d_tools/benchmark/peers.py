@@ -7,6 +7,7 @@ our own estimators, so that the comparison is about proposing and refining poses
 
 from collections.abc import Callable
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -172,11 +173,11 @@ class FeatureMatching:
                 poses.append(self._icp.refine(T, scene))
         return self._check.report(np.array(poses).reshape(-1, 4, 4), surface, view)
 
-    def _describe(self, cloud: o3d.geometry.PointCloud) -> _REGISTRATION.Feature:
+    def _describe(self, cloud: o3d.geometry.PointCloud) -> Any:
         around = o3d.geometry.KDTreeSearchParamHybrid(radius=5 * self._voxel, max_nn=100)
         return _REGISTRATION.compute_fpfh_feature(cloud, around)
 
-    def _align(self, crop: o3d.geometry.PointCloud, features: _REGISTRATION.Feature) -> np.ndarray:
+    def _align(self, crop: o3d.geometry.PointCloud, features: Any) -> np.ndarray:
         """(4, 4) pose of the model that one crop suggests."""
         # From the scene to the model: any point of a crop may lie on a neighbour, but all of the model is there.
         reach = 1.5 * self._voxel
@@ -205,7 +206,7 @@ PEERS: dict[str, Callable[[ObjectModel], Estimator]] = {
 }
 
 
-def _require_ppf():
+def _require_ppf() -> Any:
     try:
         return import_module("cv2").ppf_match_3d
     except (ImportError, AttributeError) as error:

@@ -146,7 +146,8 @@ def time_last_view(
         allowed = np.ones(len(sphere), bool)
         policy.decide(Observation(objects, positions, sphere, allowed, 5, unexplained=unexplained))
         row[:] = verified - began, fused - verified, time.perf_counter() - fused
-    return LastViewTimes(*seconds[1:].T, objects=len(objects))
+    verification, fusing, deciding = seconds[1:].T
+    return LastViewTimes(verification, fusing, deciding, len(objects))
 
 
 def resize(hypotheses: Hypotheses, count: int, rng: np.random.Generator) -> Hypotheses:

@@ -42,7 +42,7 @@ class Records:
     def __getitem__(self, key: Hashable) -> ViewResult:
         return self._results[key]
 
-    def add(self, key: tuple, result: ViewResult) -> None:
+    def add(self, key: Hashable, result: ViewResult) -> None:
         """Keep a result, on disk before this returns."""
         self._results[key] = result
         if self._path is not None:
@@ -69,7 +69,7 @@ class Records:
 
 
 def _result(entry: dict[str, Any]) -> ViewResult:
-    values = {}
+    values: dict[str, Any] = {}
     for name in (item.name for item in fields(ViewResult)):
         dtype = int if name in _INTEGERS else float
         values[name] = entry[name] if name in _PLAIN else np.array(entry[name], dtype)

@@ -31,7 +31,7 @@ from active6d_tools.cli import (
 class CommandGroup(TyperGroup):
     """Reports bad input in one line on standard error and exits with code 2."""
 
-    def invoke(self, ctx: typer.Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         """Run the command.
 
         Raises:
@@ -59,12 +59,13 @@ class CommandGroup(TyperGroup):
 class PartsCommand(TyperCommand):
     """A command whose help names all policies or estimators where its texts say {policies} or {estimators}."""
 
-    def format_help(self, ctx: typer.Context, formatter: Any) -> None:
+    def format_help(self, ctx: Any, formatter: Any) -> None:
         """Fill in the names, which are found only now: finding them imports the packages."""
         from active6d_agent.policies.registry import list_policies
         from active6d_perception.estimators.registry import list_estimators
 
-        for parameter in self.params:
+        options: list[Any] = self.params
+        for parameter in options:
             text = getattr(parameter, "help", None) or ""
             for kind, names in (("{policies}", list_policies), ("{estimators}", list_estimators)):
                 if kind in text:

@@ -1,6 +1,6 @@
 """``active6d benchmark estimator``."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -110,57 +110,54 @@ def _rates(title: str, rows: dict[str, dict[str, Any]], part: str) -> Table:
     return table
 
 
+#: Label, what is shown of a value, and the nested keys of the value.
+Detail = tuple[str, Callable[[Any], str], tuple[str, ...]]
+
+
 def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
-    """BOP's recalls and precisions, quality of the scores, times; one column per estimator."""
+    """BOP's recalls and precisions, quality of the scores, times; one column per estimator, "-" where it has none."""
     table = Table(box=None, pad_edge=False)
     table.add_column("", no_wrap=True)
     for name in rows:
         table.add_column(name, justify="right", header_style="dim")
-
-    def add(label: str, cell) -> None:
-        table.add_row(label, *(cell(row) for row in rows.values()))
-
-    for kind in ("mssd", "mspd"):
-        add(f"average recall, {kind.upper()}", lambda row, kind=kind: _interval(row[kind]["average_recall"]))
-    for least in next(iter(rows.values()))["recall_at_precision"]:
-        add(f"found at precision {least}", lambda row, least=least: _number(row["recall_at_precision"][least]))
-    for kind, label in (("pose", "10 % of the diameter"), ("mssd", "MSSD"), ("mspd", "MSPD")):
-        add(f"average precision, {label}", lambda row, kind=kind: _number(row["average_precision"][kind]))
-    _add_scores(add)
-    if all("ambiguity" in row for row in rows.values()):
-        for where in ("seen", "hidden"):
-            add(
-                f"axis rotation right, {part} {where}",
-                lambda row, where=where: _number(row["ambiguity"][where]["right_turn"]),
-            )
-        add("certainty of the axis rotation, area under the curve", lambda row: _number(row["ambiguity"]["auc"]))
-    _add_times(add, rows)
-    if any("fused" in row for row in rows.values()):
-        add(
-            "all objects, ADD: one view, fused",
-            lambda row: f"{row['fused'][0]:.2f}, {row['fused'][-1]:.2f}" if "fused" in row else "-",
-        )
+    for label, show, keys in (*_quality(rows, part), *_times(rows)):
+        found: list[Any] = list(rows.values())
+        for key in keys:
+            found = [value.get(key) if value else None for value in found]
+        table.add_row(label, *("-" if value is None else show(value) for value in found))
     return table
 
 
-def _add_scores(add: Callable) -> None:
+def _quality(rows: dict[str, dict[str, Any]], part: str) -> Iterator[Detail]:
+    for kind in ("mssd", "mspd"):
+        yield f"average recall, {kind.upper()}", _interval, (kind, "average_recall")
+    for least in next(iter(rows.values()))["recall_at_precision"]:
+        yield f"found at precision {least}", _number, ("recall_at_precision", least)
+    for kind, label in (("pose", "10 % of the diameter"), ("mssd", "MSSD"), ("mspd", "MSPD")):
+        yield f"average precision, {label}", _number, ("average_precision", kind)
     for kind, label in (("equation_1", "verification"), ("own_score", "own score")):
-        for measure, text in (("auc_adds", "area under the curve"), ("spearman_add", "rank correlation, ADD")):
-            add(f"{label}, {text}", lambda row, kind=kind, measure=measure: _number(row["verification"][kind][measure]))
+        yield f"{label}, area under the curve", _number, ("verification", kind, "auc_adds")
+        yield f"{label}, rank correlation, ADD", _number, ("verification", kind, "spearman_add")
+    if all("ambiguity" in row for row in rows.values()):
+        for where in ("seen", "hidden"):
+            yield f"axis rotation right, {part} {where}", _number, ("ambiguity", where, "right_turn")
+        yield "certainty of the axis rotation, area under the curve", _number, ("ambiguity", "auc")
 
 
-def _add_times(add: Callable, rows: dict[str, dict[str, Any]]) -> None:
+def _times(rows: dict[str, dict[str, Any]]) -> Iterator[Detail]:
     crowded = all("crowded" in row["time"] for row in rows.values())
     for which, label in (("all", "all views"), *([("crowded", "14 objects or more")] if crowded else [])):
         for key, clock in (("total", "ms"), ("cpu", "CPU ms")):
-            add(f"{clock}, {label}: median (95 %)", lambda row, which=which, key=key: _time(row["time"][which], key))
+            yield f"{clock}, {label}: median (95 %)", _time, ("time", which, key)
     which = "crowded" if crowded else "all"
     for stage in dict.fromkeys(stage for row in rows.values() for stage in row["time"][which]["stages"]):
-        add(f"  {stage}", lambda row, stage=stage: _time(row["time"][which]["stages"], stage))
+        yield f"  {stage}", _time, ("time", which, "stages", stage)
+    if any("fused" in row for row in rows.values()):
+        yield "all objects, ADD: one view, fused", lambda rates: f"{rates[0]:.2f}, {rates[-1]:.2f}", ("fused",)
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+def _number(value: float) -> str:
+    return f"{value:.2f}"
 
 
 def _interval(rate: dict[str, Any]) -> str:
@@ -169,5 +166,5 @@ def _interval(rate: dict[str, Any]) -> str:
     return f"{rate['rate']:.3f}\n[dim]{rate['low']:.2f}-{rate['high']:.2f}[/dim]"  # narrow enough for 80 columns
 
 
-def _time(times: dict[str, Any], key: str) -> str:
-    return f"{times[key]['median_ms']:.0f} ({times[key]['p95_ms']:.0f})" if key in times else "-"
+def _time(times: dict[str, float]) -> str:
+    return f"{times['median_ms']:.0f} ({times['p95_ms']:.0f})"

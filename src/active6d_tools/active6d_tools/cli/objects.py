@@ -167,5 +167,5 @@ def _render(model: "ObjectModel") -> "np.ndarray":
     for azimuth in np.radians((-60.0, 30.0, 120.0, 210.0)):
         toward = np.array([np.cos(azimuth), np.sin(azimuth), 0.58])
         eye = target + 3.0 * model.diameter * toward / np.linalg.norm(toward)
-        pictures.append(renderer.render(look_at(eye, target), camera).color)
+        pictures.append(np.asarray(renderer.render(look_at(eye, target), camera).color))
     return np.hstack(pictures)

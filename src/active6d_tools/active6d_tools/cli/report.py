@@ -50,11 +50,10 @@ def print_summary(analysis: "EpisodeAnalysis") -> None:
     from rich.table import Table
 
     record, last = analysis.record, analysis.steps[-1]
-    known = last.truth is not None
     title = "  ".join(part for part in (record.scene or analysis.model.name, record.policy) if part)
     table = Table(box=None, pad_edge=False, title=escape(title), title_justify="left", title_style="bold")
     columns = ["view", "camera", "moved", "hypotheses", "objects", "attends to"]
-    for column in [*columns, *(["found", "ADD"] if known else [])]:
+    for column in [*columns, *(["found", "ADD"] if last.truth else [])]:
         table.add_column(column, justify="right", header_style="dim", no_wrap=True)
     for step in analysis.steps:
         truth = step.truth
@@ -70,9 +69,11 @@ def print_summary(analysis: "EpisodeAnalysis") -> None:
             *scored,
         )
     console.print(table)
-    found = f"found {last.truth.detected.sum()} of {len(last.truth.detected)} objects, " if known else ""
-    error = f"mean ADD {last.truth.mean_e_add_mm:.1f} mm, " if known else f"{len(last.rows)} objects, "
-    console.print(f"{found}{error}{analysis.distance_m:.2f} m in {len(analysis.steps) - 1} moves", highlight=False)
+    found = f"{len(last.rows)} objects"
+    if last.truth:
+        found = f"found {last.truth.detected.sum()} of {len(last.truth.detected)} objects, "
+        found += f"mean ADD {last.truth.mean_e_add_mm:.1f} mm"
+    console.print(f"{found}, {analysis.distance_m:.2f} m in {len(analysis.steps) - 1} moves", highlight=False)
     times = ", ".join(f"{time.node} {time.median_ms:.1f} ms" for time in analysis.node_times)
     if times:
         console.print(f"median per view: {times}", style="dim", highlight=False, markup=False)

@@ -103,14 +103,14 @@ class EpisodeAnalysis:
 
     def summary(self) -> dict:
         """The numbers for JSON."""
-        known = self.record.ground_truth is not None
+        truth = self.record.ground_truth
         return {
             "object": self.model.name,
             "scene": self.record.scene,
             "seed": self.record.seed,
             "policy": self.record.policy,
             "end_reason": self.record.end_reason,
-            "objects_true": len(self.record.ground_truth) if known else None,
+            "objects_true": None if truth is None else len(truth),
             "distance_m": self.distance_m,
             "steps": [
                 {
@@ -176,7 +176,10 @@ def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAna
 
 def _rows(step: RecordedStep, objects: SceneObjects, truth: SceneScore | None) -> list[ObjectRow]:
     attention = step.attention if step.attention is not None and len(step.attention) == len(objects) else None
-    matched = {} if truth is None else {int(k): n for n, k in enumerate(truth.matched) if k >= 0}
+    errors, detected = {}, {}
+    if truth is not None:
+        for k, error, found in zip(truth.matched.tolist(), truth.e_add_mm, truth.detected, strict=True):
+            errors[k], detected[k] = float(error), bool(found)
     return [
         ObjectRow(
             index=i,
@@ -186,8 +189,8 @@ def _rows(step: RecordedStep, objects: SceneObjects, truth: SceneScore | None) -
             spread_mm=1e3 * float(objects.spread[i]),
             attention=None if attention is None else float(attention[i]),
             attended=step.attended == i,
-            e_add_mm=float(truth.e_add_mm[matched[i]]) if i in matched else None,
-            detected=i in matched and bool(truth.detected[matched[i]]),
+            e_add_mm=errors.get(i),
+            detected=detected.get(i, False),
         )
         for i in range(len(objects))
     ]

@@ -91,6 +91,6 @@ def outline_step(drawer: SilhouetteDrawer, step: StepAnalysis, truth: np.ndarray
     view, hypotheses = step.record.view, step.record.hypotheses
     T_camera_world = invert(view.T_world_camera)
     in_view = hypotheses.T_camera_object if hypotheses is not None else np.zeros((0, 4, 4))
-    missed = truth[~step.truth.detected] if step.truth is not None else np.zeros((0, 4, 4))
+    missed = np.zeros((0, 4, 4)) if truth is None or step.truth is None else truth[~step.truth.detected]
     groups = (T_camera_world @ step.objects.T_world_object, in_view, T_camera_world @ missed)
     return StepOutlines(*([drawer.outline(T, view.camera, view.depth) for T in poses] for poses in groups))

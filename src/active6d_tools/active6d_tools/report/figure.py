@@ -49,16 +49,17 @@ def _draw_course(axes: Axes, steps: list[StepAnalysis]) -> None:
     axes.tick_params(colors=SOFT, length=3)
     axes.set_xticks(numbers if len(numbers) <= 12 else np.unique(np.linspace(0, numbers[-1], 6).round()))
     axes.set_xlabel("moves", color=SOFT)
-    if any(step.truth is None for step in steps):
+    scores = [step.truth for step in steps if step.truth is not None]
+    if len(scores) < len(steps):
         axes.plot(numbers, [len(step.rows) for step in steps], color=ACCENT, marker="o")
         axes.set_title("objects accumulated", loc="left", size=9, color=ACCENT)
         axes.set_ylim(bottom=0)
         return
-    axes.plot(numbers, [100 * step.truth.detection_rate for step in steps], color=ACCENT, marker="o", ms=4)
+    axes.plot(numbers, [100 * score.detection_rate for score in scores], color=ACCENT, marker="o", ms=4)
     axes.set_ylim(0, 100)
     axes.set_title("objects found, %", loc="left", size=9, color=ACCENT)
     errors = axes.twinx()
-    errors.plot(numbers, [step.truth.mean_e_add_mm for step in steps], color="#d4572a", marker="s", ms=4)
+    errors.plot(numbers, [score.mean_e_add_mm for score in scores], color="#d4572a", marker="s", ms=4)
     errors.set_ylim(0, 50)
     errors.tick_params(colors=SOFT, length=3)
     errors.spines[["top", "left"]].set_visible(False)

@@ -102,9 +102,10 @@ def _facts(analysis: EpisodeAnalysis) -> list[tuple[str, str]]:
 
 
 def _charts(steps: list[StepAnalysis]) -> list[Chart]:
-    if all(step.truth is not None for step in steps):
-        rates = [100 * step.truth.detection_rate for step in steps]
-        errors = [step.truth.mean_e_add_mm for step in steps]
+    scores = [step.truth for step in steps if step.truth is not None]
+    if len(scores) == len(steps):
+        rates = [100 * score.detection_rate for score in scores]
+        errors = [score.mean_e_add_mm for score in scores]
         return [
             _chart("Objects found, %", rates, 100.0, "{:.0f}"),
             _chart("Mean ADD, mm (missed: 50)", errors, 50.0, "{:.1f}"),

@@ -2,6 +2,7 @@
 
 import io
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,7 +20,7 @@ ACCENT = "#1769e0"
 INK = "#1b1f24"
 SOFT = "#6b7480"
 #: Text from a bag is drawn literally: a "$" in it starts no formula.
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "axes.edgecolor": "#c9d0d8",
@@ -88,20 +89,20 @@ def draw_path(axes: Axes, analysis: EpisodeAnalysis, colors: list[str]) -> None:
     meridians = [sphere.position(np.full(91, level), turn[:91]) for level in np.arange(6) * np.pi / 6]
     for line in (*rings, *meridians):
         _draw_line(axes, line, projection, color=SOFT, lw=0.6, alpha=0.4)
-    axes.scatter(*(sphere.positions @ plane).T, s=3, color=SOFT, alpha=0.45, linewidths=0)
+    x, y = (sphere.positions @ plane).T
+    axes.scatter(x, y, s=3, color=SOFT, alpha=0.45, linewidths=0)
     centers = analysis.steps[-1].objects.T_world_object[:, :3, 3]
     nearest_last = np.argsort(centers @ toward)
     shades = [colors[i] for i in nearest_last]
-    axes.scatter(
-        *(centers[nearest_last] @ plane).T, s=70, c=shades, edgecolors="white", linewidths=0.6, label="objects"
-    )
+    x, y = (centers[nearest_last] @ plane).T
+    axes.scatter(x, y, s=70, c=shades, edgecolors="white", linewidths=0.6, label="objects")
     arcs = [_arc(start, end, sphere.radius) for start, end in pairwise(cameras)]
     for arc in arcs:
         _draw_line(axes, arc, projection, color=ACCENT, lw=2.2)
-    for number, position in enumerate(cameras @ plane):
+    for number, (x, y) in enumerate(cameras @ plane):
         fill, ink = (ACCENT, "white") if number == len(cameras) - 1 else ("white", ACCENT)
         circle = {"boxstyle": "circle,pad=0.28", "facecolor": fill, "edgecolor": ACCENT}
-        axes.text(*position, str(number), size=8, weight="bold", color=ink, ha="center", va="center", bbox=circle)
+        axes.text(x, y, str(number), size=8, weight="bold", color=ink, ha="center", va="center", bbox=circle)
     if arcs:
         _name_ends(axes, cameras @ plane, np.concatenate(arcs) @ plane)
     axes.set_aspect("equal", adjustable="datalim")
@@ -114,7 +115,7 @@ def _name_ends(axes: Axes, cameras: np.ndarray, path: np.ndarray) -> None:
     angles = np.arange(16) * np.pi / 8
     around = np.stack([1.5 * np.cos(angles), np.sin(angles)], axis=1)
     size = 0.16 * np.ptp(path, axis=0).max()
-    style = {"size": 8, "color": ACCENT, "ha": "center", "va": "center", "textcoords": "offset points"}
+    style: dict[str, Any] = {"size": 8, "color": ACCENT, "ha": "center", "va": "center", "textcoords": "offset points"}
     halo = [withStroke(linewidth=2.5, foreground="white")]
     for word, camera in (("start", cameras[0]), ("end", cameras[-1])):
         gaps = np.linalg.norm((camera + size * around)[:, None] - path, axis=-1).min(axis=1)
@@ -140,7 +141,7 @@ def clearest_projection(sphere: ViewSphere, cameras: np.ndarray) -> np.ndarray:
     return projections[np.argmax(clear + 0.05 * front)]
 
 
-def _draw_line(axes: Axes, points: np.ndarray, projection: np.ndarray, *, alpha: float = 1.0, **style) -> None:
+def _draw_line(axes: Axes, points: np.ndarray, projection: np.ndarray, *, alpha: float = 1.0, **style: Any) -> None:
     """(n, 3) points as a line that is paler where it runs on the far side."""
     drawn, near = points @ projection[:2].T, points @ projection[2] >= 0
     for side, shade in ((near, alpha), (~near, 0.45 * alpha)):

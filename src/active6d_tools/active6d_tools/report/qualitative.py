@@ -1,5 +1,7 @@
 """An episode as the paper's qualitative figure: before and after, attention against scores, the path (supplement B)."""
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -86,9 +88,16 @@ def _mark_attended(axes: Axes, drawer: SilhouetteDrawer, step: StepAnalysis, mov
             places.append((center, [str(move.number + 1)]))
     box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": INK, "linewidth": 0.8}
     leader = {"arrowstyle": "-", "color": "white", "linewidth": 1.5, "shrinkA": 0, "shrinkB": 0}
-    style = {"size": 8, "weight": "bold", "ha": "center", "va": "center", "bbox": box, "arrowprops": leader}
+    style: dict[str, Any] = {
+        "size": 8,
+        "weight": "bold",
+        "ha": "center",
+        "va": "center",
+        "bbox": box,
+        "arrowprops": leader,
+    }
     for center, numbers in places:
-        axes.annotate(", ".join(numbers), center, (-16, 14), textcoords="offset points", **style)
+        axes.annotate(", ".join(numbers), tuple(center), (-16, 14), textcoords="offset points", **style)
 
 
 def _draw_moves(figure: Figure, analysis: EpisodeAnalysis, moves: list[StepAnalysis]) -> None:
@@ -127,7 +136,7 @@ def _draw_bars(score: Axes, attention: Axes, move: StepAnalysis, colors: list[st
     elif rows[0].attention is None:
         attention.text(0.0, 0.5, "not recorded", transform=attention.transAxes, size=8, color=SOFT, va="center")
     else:
-        attention.bar(places, [row.attention for row in rows], color=ACCENT)
+        attention.bar(places, [row.attention or 0.0 for row in rows], color=ACCENT)
     for place in (place for place, row in enumerate(rows) if row.attended):
         for axes in (score, attention):
             axes.axvspan(place - 0.5, place + 0.5, color=INK, alpha=0.12, linewidth=0, zorder=0)
@@ -138,13 +147,16 @@ def _draw_header(figure: Figure, analysis: EpisodeAnalysis) -> None:
     name = analysis.record.scene or analysis.model.name
     title = figure.text(0.01, height, name, size=13, weight="bold", va="center")
     parts = [analysis.record.policy, "1 move" if moves == 1 else f"{moves} moves"]
-    subtitle, beside = "   ".join(part for part in parts if part), {"xycoords": title, "textcoords": "offset points"}
+    subtitle = "   ".join(part for part in parts if part)
+    beside: dict[str, Any] = {"xycoords": title, "textcoords": "offset points"}
     figure.add_artist(Annotation(subtitle, (1, 0.5), (12, 0), size=10, color=SOFT, va="center", **beside))
-    keys = [Line2D([], [], ls="none", marker="s", mfc="white", mec=INK, label="attended to, and for which move")]
+    keys: list[Any] = [
+        Line2D([], [], ls="none", marker="s", mfc="white", mec=INK, label="attended to, and for which move")
+    ]
     if analysis.record.ground_truth is None:
         panels.draw_score_bar(figure, score_scale(analysis), 0.62, height, 0.09)
     else:
         found = f"found: ADD below {analysis.threshold_mm:.1f} mm"
         keys = [Patch(color=_FOUND, label=found), Patch(color=_WRONG, label="wrong pose"), *keys]
-    place = {"loc": "center right", "bbox_to_anchor": (1.0, height), "ncols": len(keys)}
+    place: dict[str, Any] = {"loc": "center right", "bbox_to_anchor": (1.0, height), "ncols": len(keys)}
     figure.legend(handles=keys, frameon=False, fontsize=9, handlelength=1, columnspacing=1.2, **place)

@@ -1,6 +1,7 @@
 """Silhouettes of a posed model in a picture, with what the measured depth hides cut away."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -8,7 +9,7 @@ from contourpy import contour_generator
 from matplotlib.path import Path as Polygon
 from scipy.ndimage import binary_opening, gaussian_filter
 
-from active6d_core.camera import PinholeCamera, pixel_rays
+from active6d_core.camera import PinholeCamera, pixel_rays, project
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, transform_points
 from active6d_perception.model.model_views import ray_caster
@@ -99,7 +100,7 @@ class SilhouetteDrawer:
 def _project_in_front(points: np.ndarray, camera: PinholeCamera) -> np.ndarray | None:
     if not (points[:, 2] > 0.01).all():
         return None
-    return points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return project(points, camera)
 
 
 def _contours(mask: np.ndarray, offset: np.ndarray) -> list[np.ndarray]:
@@ -107,15 +108,16 @@ def _contours(mask: np.ndarray, offset: np.ndarray) -> list[np.ndarray]:
     if not mask.any():
         return []
     padded = np.pad(binary_opening(mask, np.ones((3, 3))), 2)
-    lines = contour_generator(z=gaussian_filter(padded.astype(np.float32), 0.7)).lines(0.5)
+    lines: Any = contour_generator(z=gaussian_filter(padded.astype(np.float32), 0.7)).lines(0.5)
     polygons = (Polygon(line) for line in lines if _area(line) > 12.0)
-    return [_simplify(polygon).vertices - 2.0 + offset for polygon in polygons]
+    return [_simplify(polygon) - 2.0 + offset for polygon in polygons]
 
 
-def _simplify(polygon: Polygon) -> Polygon:
+def _simplify(polygon: Polygon) -> np.ndarray:
+    """(n, 2) vertices, fewer than the polygon's."""
     polygon.simplify_threshold = 0.35
     simple = polygon.cleaned(simplify=True)
-    return Polygon(simple.vertices[simple.codes != Polygon.STOP])
+    return np.asarray(simple.vertices)[simple.codes != Polygon.STOP]
 
 
 def _area(line: np.ndarray) -> float:

@@ -79,7 +79,7 @@ JOBS = {
 }
 
 
-def read_reports(root: Path) -> dict[str, Measured]:
+def read_reports(root: Path) -> Mapping[str, Measured]:
     """Results by object and job, of those jobs that have been run.
 
     Raises:

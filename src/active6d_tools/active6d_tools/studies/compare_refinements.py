@@ -10,6 +10,7 @@ Example: python -m active6d_tools.studies.compare_refinements mug
 """
 
 from time import process_time
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -28,8 +29,8 @@ from active6d_perception.estimators.refinement import refine
 from active6d_perception.model.model_views import model_views
 from active6d_tools.studies.arguments import read_arguments
 
-DEPLOYED = {"gates": (0.008, 0.004), "iterations": 3, "samples": 192}
-VARIANTS = {
+DEPLOYED: dict[str, Any] = {"gates": (0.008, 0.004), "iterations": 3, "samples": 192}
+VARIANTS: dict[str, dict[str, Any]] = {
     "not refined": {"gates": ()},
     "as deployed": {},
     "5 steps a gate": {"iterations": 5},

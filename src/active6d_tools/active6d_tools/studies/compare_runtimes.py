@@ -14,6 +14,7 @@ from copy import deepcopy
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -67,7 +68,8 @@ def measure(answer: Answer, repeats: int) -> tuple[float, float]:
         clock, processor = time.perf_counter(), time.process_time()
         answer()
         times.append((time.perf_counter() - clock, time.process_time() - processor))
-    return tuple(1e3 * np.median(times[2:], axis=0))
+    clock, processor = 1e3 * np.median(times[2:], axis=0)
+    return float(clock), float(processor)
 
 
 def axis_error(answer: np.ndarray, reference: np.ndarray) -> float:
@@ -97,9 +99,10 @@ def torch_runtimes(network: DenseNetwork, inputs: list[np.ndarray]) -> Iterator[
     """Memory format, merged normalisation, precision, quantisation."""
     plain = torch.from_numpy(inputs[0])
     last = plain.contiguous(memory_format=torch.channels_last)
-    unmerged = deepcopy(network).to(memory_format=torch.channels_last)
-    merged = fused(network).to(memory_format=torch.channels_last)
-    half, half_input = fused(network).to(torch.bfloat16, memory_format=torch.channels_last), last.bfloat16()
+    unmerged, merged = cast(Any, deepcopy(network)), cast(Any, fused(network))
+    unmerged.to(memory_format=torch.channels_last)
+    merged.to(memory_format=torch.channels_last)
+    half, half_input = deepcopy(merged).to(torch.bfloat16, memory_format=torch.channels_last), last.bfloat16()
     yield "torch, float32", lambda: network(plain)[0].numpy()
     yield "torch, float32, channels last", lambda: unmerged(last)[0].numpy()
     yield "torch, float32, channels last, merged", lambda: merged(last)[0].numpy()
@@ -115,7 +118,7 @@ def onnx_runtimes(path: Path, inputs: list[np.ndarray], threads: int) -> Iterato
         def __init__(self) -> None:
             self._left = iter({"x": each} for each in inputs)
 
-        def get_next(self) -> dict | None:
+        def get_next(self) -> dict[str, np.ndarray] | None:
             return next(self._left, None)
 
     quantised = path.with_name("int8.onnx")
@@ -124,7 +127,7 @@ def onnx_runtimes(path: Path, inputs: list[np.ndarray], threads: int) -> Iterato
     options.intra_op_num_threads = threads
     for name, file in (("float32", path), ("int8", quantised)):
         session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
-        yield f"ONNX Runtime, {name}", lambda session=session: session.run(None, {"x": inputs[0]})[0][0]
+        yield f"ONNX Runtime, {name}", lambda: session.run(None, {"x": inputs[0]})[0][0]  # noqa: B023 (runs at once)
 
 
 def openvino_runtimes(path: Path, inputs: list[np.ndarray], threads: int) -> Iterator[tuple[str, Answer]]:
@@ -135,7 +138,7 @@ def openvino_runtimes(path: Path, inputs: list[np.ndarray], threads: int) -> Ite
     for name, hint in (("float32", "f32"), ("bfloat16", "bf16")):
         settings = {"INFERENCE_NUM_THREADS": threads, "INFERENCE_PRECISION_HINT": hint, "PERFORMANCE_HINT": "LATENCY"}
         request = core.compile_model(core.read_model(path), "CPU", settings).create_infer_request()
-        yield f"OpenVINO, {name}", lambda request=request: np.array(request.infer({0: inputs[0]})[0][0])
+        yield f"OpenVINO, {name}", lambda: np.array(request.infer({0: inputs[0]})[0][0])  # noqa: B023 (runs at once)
 
 
 if __name__ == "__main__":

@@ -34,8 +34,8 @@ def compare_true_poses(model: ObjectModel) -> None:
         for scene in scenes:
             everything = np.concatenate([scene.T_world_object, scene.T_world_hidden])
             expected.append(visibility.shares(everything, eyes, tray)[: len(scene.T_world_object)].ravel())
-        expected = np.concatenate(expected)
-        off, correlation = np.abs(expected - rendered).mean(), np.corrcoef(expected, rendered)[0, 1]
+        found = np.concatenate(expected)
+        off, correlation = np.abs(found - rendered).mean(), np.corrcoef(found, rendered)[0, 1]
         print(f"{model.name} {what:14} mean difference {off:.3f}, correlation {correlation:.3f}")
 
 

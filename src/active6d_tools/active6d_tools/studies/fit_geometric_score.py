@@ -7,7 +7,8 @@ pictures of random boxes, cylinders, cones and walls, hold no object that is loo
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import cast
 
 import numpy as np
 import open3d as o3d
@@ -54,18 +55,19 @@ def clutter(rng: np.random.Generator) -> np.ndarray:
         wall.apply_transform(_pose(rng, (far, far + 1.0)))
         parts.append(wall)
     for _ in range(rng.integers(8, 30)):
-        part = [
+        shapes: list[Callable[[], trimesh.Trimesh]] = [
             lambda: trimesh.creation.box(rng.uniform(0.02, 0.3, 3)),
             lambda: trimesh.creation.cylinder(rng.uniform(0.003, 0.06), rng.uniform(0.05, 0.4)),
             lambda: trimesh.creation.icosphere(3, rng.uniform(0.02, 0.08)),
             lambda: trimesh.creation.capsule(rng.uniform(0.1, 0.5), rng.uniform(0.003, 0.02)),
             lambda: trimesh.creation.cone(rng.uniform(0.02, 0.08), rng.uniform(0.05, 0.15)),
-        ][rng.integers(5)]()
+        ]
+        part = shapes[rng.integers(5)]()
         part.apply_transform(_pose(rng, (0.5, far)))
         parts.append(part)
     rays = pixel_rays(DEFAULT_CAMERA)
     bundle = o3d.core.Tensor(np.concatenate([np.zeros_like(rays), rays], axis=-1))
-    depth = ray_caster(trimesh.util.concatenate(parts)).cast_rays(bundle)["t_hit"].numpy()
+    depth = ray_caster(cast(trimesh.Trimesh, trimesh.util.concatenate(parts))).cast_rays(bundle)["t_hit"].numpy()
     depth[~np.isfinite(depth)] = np.nan
     noise = gaussian_filter(rng.normal(size=depth.shape), 1.2)
     inverse = 1.0 / depth + rng.uniform(0.001, 0.004) * noise / noise.std()

@@ -16,7 +16,7 @@ from scipy.special import softmax
 from active6d_core.camera import pool_depth
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
-from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, rotation_about_z
+from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, CanonicalFrame, rotation_about_z
 from active6d_perception.estimators.dense.decoding import axis_rotation_probability, decode
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
@@ -30,7 +30,7 @@ RIGHT, WRONG, TOLERATED = np.radians([2.6, 30.0, 22.0])
 
 
 def count(
-    sample: TrainingView, estimator: DenseEstimator, search: AxisRotationSearch, canonical_frame
+    sample: TrainingView, estimator: DenseEstimator, search: AxisRotationSearch, canonical_frame: CanonicalFrame
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, turns, 28) pixels by case, and (n,) true turn, of the instances whose centre and axis are right."""
     model, view = estimator.model, sample.view
