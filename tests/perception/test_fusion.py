@@ -13,6 +13,8 @@ from active6d_core.se3 import invert, make_transform, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
+from active6d_perception.scene import fusion as fusion_module
+from active6d_perception.scene.clustering import cluster_groups
 from active6d_perception.scene.fusion import FusionParameters, SceneFusion, cluster, project_features, select
 
 NAMES = ("coffee_cup", "bunny", "mug")
@@ -217,6 +219,29 @@ def test_clusters_are_those_of_naive_agglomeration(seed):
     assert {frozenset(group) for group in groups} == {
         frozenset(np.flatnonzero(labels == label)) for label in set(labels)
     }
+
+
+def test_a_large_group_is_clustered_alike():
+    points = np.random.default_rng(5).random((400, 3)) * [20.0, 1.0, 1.0]
+    distance = np.round(np.linalg.norm(points[:, None] - points[None], axis=-1), 7)
+    labels = cluster(distance, 0.6)
+    np.testing.assert_array_equal(labels, cluster_groups(distance[None], np.ones((1, 400), bool), 0.6)[0])
+    assert 20 < len(set(labels)) < 400
+
+
+def test_scattered_hypotheses_without_end_keep_their_cost(monkeypatch):
+    monkeypatch.setattr(fusion_module, "MOST_HYPOTHESES", 100)
+    fusion, T_world_camera = SceneFusion(load_object("mug")), ViewSphere().pose(ViewSphere().positions[40])
+    rng, best = np.random.default_rng(0), 0.0
+    for stamp in range(1, 21):
+        T = make_transform(np.tile(np.eye(3), (20, 1, 1)), [0, 0, 0.8] + rng.uniform(-0.15, 0.15, (20, 3)))
+        box, mask = np.tile([0.2, 0.2, 0.4, 0.4], (20, 1)), np.ones((4, 4), np.uint16)
+        hypotheses = Hypotheses(T, rng.random(20), box, np.full(20, 0.8), np.ones(20, np.uint16), mask)
+        fusion.add_view(stamp, T_world_camera, hypotheses, np.full(20, 0.5))
+        best = max(best, hypotheses.score.max())
+    objects = fusion.objects(20, T_world_camera, DEFAULT_CAMERA)
+    assert len(fusion._distances) == 100
+    assert objects.score.max() == best  # the best are kept, whenever they came
 
 
 def test_bad_parameters_and_scores_are_named():

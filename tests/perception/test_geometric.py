@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
+import tracemalloc
 from functools import lru_cache
 
 import numpy as np
 import pytest
 
-from active6d_core.camera import View
+from active6d_core.camera import PinholeCamera, View
 from active6d_core.metrics import add_s, e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
@@ -89,6 +90,19 @@ def test_nothing_to_see(depth):
     view = captures(model, (50,), seed=3, count=1)[0].view
     blank = View(1, view.color, np.full_like(view.depth, depth), view.camera, view.T_world_camera)
     assert len(create_estimator("geometric", model).estimate(blank)) == 0
+
+
+def test_noise_in_all_of_space_costs_no_more_than_a_heap():
+    depth = np.random.default_rng(0).uniform(0.3, 1.5, (240, 320)).astype(np.float32)
+    camera = PinholeCamera.from_field_of_view(320, 240, 60.0)
+    view = View(1, np.zeros((240, 320, 3), np.uint8), depth, camera, np.eye(4))
+    estimator = create_estimator("geometric", load_object("mug"))
+    tracemalloc.start()
+    try:
+        estimator.estimate(view)
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_more_views_find_more():

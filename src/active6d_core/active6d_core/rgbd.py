@@ -6,11 +6,10 @@ meaning is converted. What is impossible is refused with its likely cause.
 
 import numpy as np
 
+from active6d_core.bounds import FARTHEST, PLAUSIBLE_DEPTH, check_image_size, limit_depth
 from active6d_core.camera import PinholeCamera, View, backproject
 from active6d_core.se3 import is_rigid, transform_points
 
-#: Median distances in metres between which a picture of a bin can lie.
-PLAUSIBLE_DEPTH = (0.05, 20.0)
 _MILLIMETRES = 1e-3
 
 
@@ -39,6 +38,7 @@ def make_view(
     """
     metres = check_depth(depth, depth_scale)
     height, width = metres.shape
+    check_image_size(width, height)
     color = check_color(rgb)
     if color.shape[:2] != metres.shape:
         raise ValueError(
@@ -51,6 +51,8 @@ def make_view(
     T = np.eye(4) if T_world_camera is None else np.asarray(T_world_camera, float)
     if T.shape != (4, 4) or not np.isfinite(T).all() or not is_rigid(T, 1e-3):
         raise ValueError("T_world_camera must be a rigid (4, 4) transform in metres")
+    if np.linalg.norm(T[:3, 3]) > FARTHEST:
+        raise ValueError(f"T_world_camera is over {FARTHEST:g} m from the origin; are its metres millimetres?")
     return View(stamp, color, metres, camera, T)
 
 
@@ -71,7 +73,7 @@ def check_color(rgb: np.ndarray) -> np.ndarray:
 
 
 def check_depth(depth: np.ndarray, depth_scale: float | None = None) -> np.ndarray:
-    """(H, W) float32 metres with NaN for invalid pixels; see :func:`make_view`.
+    """(H, W) float32 metres with NaN for invalid pixels and implausible distances; see :func:`make_view`.
 
     Raises:
         ValueError: another shape or type, no valid pixel, or distances that cannot be metres.
@@ -97,7 +99,7 @@ def check_depth(depth: np.ndarray, depth_scale: float | None = None) -> np.ndarr
         raise ValueError(
             f"depth has a median of {median:.4g} m; check depth_scale, which is {depth_scale:g} m per unit"
         )
-    return metres
+    return limit_depth(metres)
 
 
 def crop_depth(

@@ -7,6 +7,8 @@ message objects that rosbags deserialises.
 
 import re
 from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import copy
 from typing import Any
 
@@ -18,6 +20,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from active6d_core.bounds import check_hypotheses, check_image_size, check_objects, check_points
 from active6d_core.calibration import Calibration
 from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses, SceneObjects
@@ -49,6 +52,8 @@ _DTYPES = {
     PointField.FLOAT64: "<f8",
 }
 _DATATYPES = {dtype: datatype for datatype, dtype in _DTYPES.items()}
+#: Distortion models that with d = 0 leave an image as it is.
+_WITHOUT_DISTORTION = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "inverse_brown_conrady")
 _COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
 #: A quaternion whose norm is further from one than this was not meant as a rotation.
 _QUATERNION_TOLERANCE = 1e-2
@@ -68,6 +73,17 @@ class MessageError(ValueError):
 
 class OutdatedError(MessageError):
     """A message of a view that is over: a restarted node repeats its last messages, which is no fault."""
+
+
+@contextmanager
+def refusing(prefix: str = "") -> Iterator[None]:
+    """Turn the ValueError of a check into a :class:`MessageError` whose text begins with ``prefix``."""
+    try:
+        yield
+    except MessageError:
+        raise
+    except ValueError as error:
+        raise MessageError(f"{prefix}{error}") from error
 
 
 def stamp_to_ns(stamp: Time) -> int:
@@ -289,16 +305,15 @@ def info_to_camera(message: CameraInfo) -> PinholeCamera:
     Raises:
         MessageError: the image is not rectified, or the numbers make no camera.
     """
-    try:
+    with refusing("camera_info: "):
         calibration = Calibration.from_info(message)
-        if calibration.distorted:
+        if calibration.distorted or calibration.model not in _WITHOUT_DISTORTION:
             raise MessageError(
                 "camera_info has distortion; put the node camera_adapter between driver and graph, "
-                "or publish d = 0 if the images are rectified already"
+                "or publish d = 0 and plumb_bob if the images are rectified already"
             )
+        check_image_size(*calibration.image_size)
         return calibration.rectified_camera()
-    except ValueError as error:
-        raise error if isinstance(error, MessageError) else MessageError(f"camera_info: {error}") from error
 
 
 # Tables
@@ -318,14 +333,17 @@ def hypotheses_from_cloud(message: PointCloud2, segmentation: np.ndarray, frame:
     """A table of hypotheses and the (H, W) label image of the same view to Hypotheses.
 
     Raises:
-        MessageError: another frame, a missing column, a bad number, or a label that is 0.
+        MessageError: another frame, a missing column, a number out of its bounds, or a label without a pixel.
     """
     table = _cloud_to_table(message, HYPOTHESIS_COLUMNS, frame)
     if (table["label"] == 0).any():
         raise MessageError("hypotheses: label 0 means background")
-    return Hypotheses(
+    hypotheses = Hypotheses(
         _read_poses(table), _read(table, "score"), _read_box(table), _read(table, "depth"), table["label"], segmentation
     )
+    with refusing():
+        check_hypotheses(hypotheses)
+    return hypotheses
 
 
 def objects_to_cloud(objects: SceneObjects, stamp: int, frame: str) -> PointCloud2:
@@ -342,15 +360,18 @@ def objects_from_cloud(message: PointCloud2, frame: str) -> SceneObjects:
     """A table of accumulated objects to SceneObjects.
 
     Raises:
-        MessageError: another frame, a missing column or a bad number.
+        MessageError: another frame, a missing column or a number out of its bounds.
     """
     table = _cloud_to_table(message, OBJECT_COLUMNS, frame)
-    return SceneObjects(
+    objects = SceneObjects(
         T_world_object=_read_poses(table),
         box=_read_box(table),
         support=table["support"].astype(int),
         **{column: _read(table, column) for column in ("verification", "score", "depth", "spread")},
     )
+    with refusing():
+        check_objects(objects)
+    return objects
 
 
 def attention_to_cloud(
@@ -390,7 +411,10 @@ def points_from_cloud(message: PointCloud2, frame: str) -> np.ndarray:
         MessageError: another frame, too many points, a missing column or a number that is not finite.
     """
     table = _cloud_to_table(message, POINT_COLUMNS, frame, most=_MAX_POINTS)
-    return np.column_stack([_read(table, column) for column in POINT_COLUMNS])
+    points = np.column_stack([_read(table, column) for column in POINT_COLUMNS])
+    with refusing():
+        check_points(points)
+    return points
 
 
 def _layout(columns: dict[str, str]) -> np.dtype:
@@ -433,6 +457,9 @@ def read_table(message: Any) -> np.ndarray:
     """A PointCloud2's points as a structured array with its single-valued columns, whichever library made it.
 
     Columns of unknown types, with several values per point, or beyond the point's size are left out.
+
+    Raises:
+        MessageError: the columns make no table: two of the same name, or points of no size.
     """
     usable = [
         field
@@ -441,15 +468,16 @@ def read_table(message: Any) -> np.ndarray:
         and field.count == 1
         and field.offset + np.dtype(_DTYPES[field.datatype]).itemsize <= message.point_step
     ]
-    layout = np.dtype(
-        {
-            "names": [field.name for field in usable],
-            "formats": [_DTYPES[field.datatype] for field in usable],
-            "offsets": [field.offset for field in usable],
-            "itemsize": message.point_step,
-        }
-    )
-    return np.frombuffer(message.data, layout) if message.width * message.height else np.zeros(0, layout)
+    with refusing("table: "):
+        layout = np.dtype(
+            {
+                "names": [field.name for field in usable],
+                "formats": [_DTYPES[field.datatype] for field in usable],
+                "offsets": [field.offset for field in usable],
+                "itemsize": message.point_step,
+            }
+        )
+        return np.frombuffer(message.data, layout) if message.width * message.height else np.zeros(0, layout)
 
 
 def _fill_poses(table: np.ndarray, T: np.ndarray) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from active6d_core.bounds import FARTHEST, PLAUSIBLE_DEPTH, check_camera_pose, limit_depth
 from active6d_core.ros.conversions import (
     MessageError,
     OutdatedError,
@@ -13,6 +14,7 @@ from active6d_core.ros.conversions import (
     image_to_depth,
     info_to_camera,
     pose_to_transform,
+    refusing,
     require_frame,
     stamp_to_ns,
 )
@@ -51,7 +53,8 @@ class ViewInputs:
     nothing, so that a wrong one cannot lock the node.
 
     Args:
-        node: the node that subscribes; it gets the parameter ``pose_source``.
+        node: the node that subscribes; it gets the parameter ``pose_source``, and with ``depth`` ``depth_min`` and
+            ``depth_max``.
         parts: what it needs of the camera: of ``camera``, ``color``, ``depth`` and ``pose``.
         callback: called with the stamp in ns and {part: value}.
         others: what else belongs to a view, as {part: topic}; the node hands it to :meth:`add`.
@@ -76,6 +79,10 @@ class ViewInputs:
             choices=("topic", "tf"),
             fixed=True,
         )
+        if "depth" in parts:
+            low, high = PLAUSIBLE_DEPTH
+            node.declare("depth_min", low, "smaller depths are invalid, in metres", minimum=0.0)
+            node.declare("depth_max", high, "larger depths are invalid, in metres", minimum=0.0, maximum=FARTHEST)
         self._transforms: TransformInput | None = None
         if "pose" in parts and node.value("pose_source") == "tf":
             self._transforms = TransformInput(node)
@@ -90,7 +97,15 @@ class ViewInputs:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all that has come."""
+        """Forget all that has come, and read the parameters.
+
+        Raises:
+            ValueError: no depth is between ``depth_min`` and ``depth_max``.
+        """
+        if "depth" in self._topics:
+            low, high = self._depth_range = self._node.value("depth_min"), self._node.value("depth_max")
+            if not low < high:
+                raise ValueError(f"{self._node.get_name()}: parameter 'depth_min' must be below 'depth_max'")
         self._announced: dict[int, None] = {}
         self._expected: EpisodeStart | None = None
         self._repeated: tuple[int, dict[str, Any]] = -1, {}
@@ -158,11 +173,18 @@ class ViewInputs:
             self._on_start(start, new)
 
     def _add_pose(self, stamp: int, T_world_camera: np.ndarray) -> None:
+        with refusing():
+            check_camera_pose(T_world_camera)
         self._views.add("pose", stamp, T_world_camera)
 
     def _take(self, part: str, message: Any) -> None:
         require_frame(message.header, self._node.world_frame if part == "pose" else self._node.camera_frame)
         stamp, value = stamp_to_ns(message.header.stamp), _CAMERA[part][1](message)
+        with refusing():
+            if part == "depth":
+                value = limit_depth(value, self._depth_range)
+            elif part == "pose":
+                check_camera_pose(value)
         if self._expected is not None and stamp == self._expected.stamp:
             self._begin(self._expected, again=stamp in self._known)
         try:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import Image, PointCloud2
 
+from active6d_core.bounds import check_in_front
 from active6d_core.camera import PinholeCamera
 from active6d_core.files import atomic_file, cache_folder
 from active6d_core.hypotheses import SceneObjects
@@ -21,6 +22,7 @@ from active6d_core.ros.conversions import (
     objects_to_markers,
     points_to_cloud,
     poses_to_array,
+    refusing,
     require_frame,
     stamp_to_ns,
 )
@@ -167,6 +169,8 @@ class HypothesisFusionNode(GraphNode):
 
     def _on_view(self, stamp: int, values: dict[str, Any]) -> None:
         hypotheses = hypotheses_from_cloud(values["hypotheses"], values["segmentation"], self.camera_frame)
+        with refusing("hypotheses: "):
+            check_in_front(hypotheses.T_camera_object)
         with self.measure(stamp) as summary:
             verification = self._verifier.score(values["depth"], values["camera"], hypotheses)
             self._fusion.add_view(stamp, values["pose"], hypotheses, verification)

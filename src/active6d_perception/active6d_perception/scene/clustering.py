@@ -5,6 +5,11 @@ that their results agree.
 """
 
 import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import squareform
+
+#: Items of a group from which on scipy's linkage is faster than merging many groups at once.
+_LARGE_GROUP = 256
 
 
 def cluster_groups(distance: np.ndarray, valid: np.ndarray, cut: float) -> np.ndarray:
@@ -56,10 +61,24 @@ def cluster(distance: np.ndarray, cut: float) -> np.ndarray:
     labels = np.arange(count)
     # Clusters lie within connected components of the near pairs: no mean of larger distances is within the cut.
     members, valid = group(_components(distance <= cut))
+    if valid.shape[1] > _LARGE_GROUP:
+        # Scattered hypotheses of many views form chains. Merging one pair after the other costs the cube of a chain.
+        for items in (row[used] for row, used in zip(members, valid, strict=True)):
+            labels[items] = items[_link(distance[np.ix_(items, items)], cut)]
+        return labels
     blocks = distance[members[:, :, None], members[:, None, :]]
     local = cluster_groups(blocks, valid, cut)
     labels[members[valid]] = np.take_along_axis(members, local, axis=1)[valid]
     return labels
+
+
+def _link(distance: np.ndarray, cut: float) -> np.ndarray:
+    """:func:`cluster_groups` for one group of any size, at the cost of the square of its size."""
+    if len(distance) < 2:
+        return np.zeros(len(distance), np.intp)
+    numbers = fcluster(linkage(squareform(distance, checks=False), "average"), cut, "distance")
+    _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
+    return first[inverse]
 
 
 def _components(near: np.ndarray) -> np.ndarray:

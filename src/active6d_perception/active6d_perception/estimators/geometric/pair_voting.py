@@ -18,6 +18,8 @@ _MODEL_POINTS = 400
 _DISTANCE_BINS = 20  # of the diameter
 _ANGLE_BINS = 15  # of pi
 _ROTATION_BINS = 30  # of 2 pi
+#: Votes in one view. A heap of mugs casts under six million; noise would cast hundreds of millions.
+_MOST_VOTES = 8_000_000
 
 
 class PairVoting:
@@ -66,6 +68,11 @@ class PairVoting:
         frames = _frames(points[references], normals[references])
         rotation = _angle_about_normal(frames[row], points[column])
         matches = self._starts[feature + 1] - self._starts[feature]
+        if (total := int(matches.sum())) > _MOST_VOTES:
+            every = slice(None, None, -(-total // _MOST_VOTES))
+            row, column, rotation, matches, feature = (
+                each[every] for each in (row, column, rotation, matches, feature)
+            )
         pair = np.repeat(np.arange(len(row)), matches)
         offset = np.arange(len(pair)) - np.repeat(np.cumsum(matches) - matches, matches)
         model_pair = self._starts[feature][pair] + offset
