@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from active6d_core.bounds import PLAUSIBLE_DEPTH
 from active6d_core.calibration import Calibration
-from active6d_core.rgbd import PLAUSIBLE_DEPTH
 
 #: The median depth of a bin cannot be further from the camera's distance to it than this factor.
 _SCALE_FACTOR = 3.0
