@@ -31,7 +31,7 @@ from active6d_perception.estimators.registry import create_estimator
 from active6d_perception.scene.fusion import SceneFusion
 from active6d_perception.scene.observed_surface import ObservedSurface
 from active6d_perception.scene.verification import Verifier
-from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene import Bin, Scene
 
@@ -121,7 +121,7 @@ def test_camera_goes_where_it_was_sent_at_its_speed(record):
 
 
 def test_images_are_the_simulators(record, scene, settings):
-    simulator = Simulator(scene, record.steps[0].view.camera, SensorNoise(), settings.seed)
+    simulator = Simulator(scene, record.steps[0].view.camera, ActiveStereo(), settings.seed)
     for step in record.steps:
         # The recorded pose went through a quaternion; quantised depth shows even the last bit of that.
         grid_view = SPHERE.nearest(step.view.T_world_camera[:3, 3])

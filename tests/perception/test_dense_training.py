@@ -28,7 +28,7 @@ from active6d_perception.estimators.dense.training.samples import make_sample, r
 from active6d_perception.estimators.dense.training.targets import make_targets
 from active6d_perception.estimators.dense.training.validation import validate
 from active6d_perception.estimators.registry import create_estimator, list_estimators
-from active6d_sim.datasets.training_views import FIRST_SEED, random_camera, training_heap
+from active6d_sim.datasets.training_views import FIRST_SEED, random_camera, training_scene
 from active6d_sim.rendering.renderer import SceneRenderer
 from active6d_sim.scenes.scene import Bin, Scene
 
@@ -235,7 +235,7 @@ def test_heaps_to_learn_from_share_no_seed_with_stored_scenes():
 
     assert all(SPLIT_SEEDS[split] + count <= FIRST_SEED for split, count in SPLITS.items())
     with pytest.raises(ValueError, match="seeds from"):
-        training_heap(load_object("mug"), SPLIT_SEEDS["test"])
+        training_scene(load_object("mug"), SPLIT_SEEDS["test"])
 
 
 def test_random_cameras_look_at_the_bin_from_above():

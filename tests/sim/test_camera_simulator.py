@@ -24,7 +24,7 @@ from active6d_core.ros.conversions import (
 from active6d_core.ros.episode_messages import GoalState, GoalStatus
 from active6d_core.se3 import look_at
 from active6d_sim.nodes.camera_simulator import CameraSimulatorNode
-from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.sensor_registry import list_sensors, register_sensor
 from active6d_sim.rendering.simulator import Simulator
 
@@ -308,7 +308,7 @@ def test_before_it_is_active_it_says_so_and_ignores_goals(watched):
         ({"start_view": 100}, "'start_view' is 100, the last is 99"),
         ({"start_view": -2}, "'start_view' is -2, must be >= -1"),
         ({"noise_scale": -1.0}, "'noise_scale'"),
-        ({"sensor": "sonar"}, "'sensor' is 'sonar', must be one of active-stereo"),
+        ({"sensor": "sonar"}, "'sensor' is 'sonar', must be one of active_stereo"),
         ({"field_of_view": 180.0}, "'field_of_view'"),
         ({"camera_speed": 0.0}, "'camera_speed'"),
         ({"seed": "seven"}, "'seed' must be a int"),
@@ -324,7 +324,7 @@ def test_bad_parameters_are_named(graph, parameters, message):
 def test_noise_can_be_off(watched, mugs):
     watched.start(noise_scale=0.0)
     camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
-    clean = Simulator(mugs, camera, SensorNoise.off()).capture(SPHERE.pose(SPHERE.positions[45]), SECOND)
+    clean = Simulator(mugs, camera, ActiveStereo().scaled(0)).capture(SPHERE.pose(SPHERE.positions[45]), SECOND)
     np.testing.assert_array_equal(image_to_depth(watched.boxes["camera/depth/image_raw"][0]), clean.depth)
 
 
@@ -343,7 +343,7 @@ class ConstantDepth:
 
 
 def test_another_sensor_measures(watched):
-    assert list_sensors() == ["active-stereo", "constant-depth"]
+    assert list_sensors() == ["active_stereo", "constant-depth"]
     watched.start(sensor="constant-depth", noise_scale=3.0)
     depth = image_to_depth(watched.boxes["camera/depth/image_raw"][0])
     np.testing.assert_array_equal(depth, np.full((48, 64), 1.5, np.float32))

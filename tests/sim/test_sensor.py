@@ -7,16 +7,16 @@ from hypothesis import strategies as st
 
 from active6d_core.camera import PinholeCamera, pixel_rays
 from active6d_core.object_model import load_object
+from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.renderer import RenderedView
-from active6d_sim.rendering.sensor import SensorNoise
 from active6d_sim.rendering.sensor_registry import create_sensor, sensor_origins
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240, 60.0)
-NOTHING = SensorNoise.off()
+NOTHING = ActiveStereo().scaled(0)
 
 
-def only(**parameters) -> SensorNoise:
-    return SensorNoise(**{**vars(NOTHING), **parameters})
+def only(**parameters) -> ActiveStereo:
+    return ActiveStereo(**{**vars(NOTHING), **parameters})
 
 
 def wall(depth=0.8, degrees=0.0) -> RenderedView:
@@ -51,7 +51,7 @@ def test_sigma_grows_with_the_square_of_the_distance(depth):
 
 def test_sigma_of_a_vga_image_at_working_distance_is_as_documented():
     vga = PinholeCamera.from_field_of_view(640, 480, 60.0)
-    assert SensorNoise().depth_sigma(0.8, vga) == pytest.approx(1.5e-3, rel=0.03)
+    assert ActiveStereo().depth_sigma(0.8, vga) == pytest.approx(1.5e-3, rel=0.03)
 
 
 def test_error_is_correlated_over_a_patch_and_not_beyond():
@@ -114,7 +114,7 @@ def test_color_noise_has_its_sigma():
 def test_off_is_the_identity():
     view = wall(np.linspace(0.5, 1.0, CAMERA.width), degrees=89)
     view.depth[:3] = np.nan
-    color, depth = measure(view, SensorNoise.off())
+    color, depth = measure(view, ActiveStereo().scaled(0))
     np.testing.assert_array_equal(color, view.color)
     np.testing.assert_array_equal(depth, view.depth)
     assert depth.dtype == np.float32
@@ -127,7 +127,7 @@ def test_default_sensor_keeps_what_has_no_depth_missing():
 
 
 def test_same_generator_same_measurement():
-    first, again, other = (measure(wall(), SensorNoise(), seed) for seed in (3, 3, 4))
+    first, again, other = (measure(wall(), ActiveStereo(), seed) for seed in (3, 3, 4))
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(first[1], other[1], equal_nan=True)
@@ -135,13 +135,13 @@ def test_same_generator_same_measurement():
 
 @given(st.floats(0.01, 1e3))
 def test_scaled(factor):
-    noise = SensorNoise().scaled(factor)
+    noise = ActiveStereo().scaled(factor)
     assert noise.disparity == pytest.approx(0.07 * factor)
     assert noise.color == pytest.approx(2.0 * factor)
     assert noise.edge_loss == pytest.approx(min(0.5 * factor, 1.0))
     assert noise.speckle_loss == pytest.approx(min(0.002 * factor, 1.0))
     assert (noise.quantum, noise.jitter, noise.grazing_degrees) == (0.0005, 1, 82.0)
-    assert SensorNoise().scaled(0.0) == SensorNoise.off()
+    assert ActiveStereo().scaled(0.0) == ActiveStereo().scaled(0)
 
 
 @pytest.mark.parametrize(
@@ -150,11 +150,11 @@ def test_scaled(factor):
 )
 def test_bad_parameters_are_named(name, value):
     with pytest.raises(ValueError, match=name):
-        SensorNoise(**{name: value})
+        ActiveStereo(**{name: value})
 
 
 def test_the_default_sensor_is_active_stereo():
-    assert create_sensor("active-stereo", load_object("mug")) == SensorNoise()
-    assert sensor_origins()["active-stereo"] == "built in"
-    with pytest.raises(ValueError, match="unknown sensor 'sonar'; known: auto, active-stereo"):
+    assert create_sensor("active_stereo", load_object("mug")) == ActiveStereo()
+    assert sensor_origins()["active_stereo"] == "built in"
+    with pytest.raises(ValueError, match="unknown sensor 'sonar'; known: auto, active_stereo"):
         create_sensor("sonar", load_object("mug"))

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from active6d_core.se3 import look_at
+from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.renderer import SceneRenderer
-from active6d_sim.rendering.sensor import SensorNoise
 from active6d_sim.rendering.simulator import GoalError, Simulator, admit_goal, arrival
 
 SECOND = 1_000_000_000
@@ -93,7 +93,7 @@ def test_view_says_where_and_when(simulator):
 
 def test_perfect_sensor_sees_what_is_rendered():
     T_world_camera = SPHERE.pose(SPHERE.positions[45])
-    view = Simulator(three_mugs(), CAMERA, SensorNoise.off(), seed=3).capture(T_world_camera, SECOND)
+    view = Simulator(three_mugs(), CAMERA, ActiveStereo().scaled(0), seed=3).capture(T_world_camera, SECOND)
     rendered = SceneRenderer(three_mugs(), appearance_seed=3).render(T_world_camera, CAMERA)
     np.testing.assert_array_equal(view.depth, rendered.depth)
     np.testing.assert_array_equal(view.color, rendered.color)

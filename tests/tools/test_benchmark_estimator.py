@@ -14,8 +14,8 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.geometric.foreground import measure_surface
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.estimators.single_view_evaluation import EstimatorResult, ViewResult
+from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.renderer import SceneRenderer
-from active6d_sim.rendering.sensor import SensorNoise
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene import Bin, Scene
 from active6d_tools.benchmark import estimator_views as benchmark
@@ -144,7 +144,7 @@ def test_views_are_those_of_the_simulator():
     views = GridViews(load_object("bunny"), [scene], seed=3)
     for noise in (1.0, 2.0):
         view = views.capture(0, 40, noise).view
-        simulator = Simulator(scene, noise=SensorNoise().scaled(noise), seed=3)
+        simulator = Simulator(scene, noise=ActiveStereo().scaled(noise), seed=3)
         expected = simulator.capture(SPHERE.pose(SPHERE.positions[40]), view.stamp)
         np.testing.assert_array_equal(view.depth, expected.depth)
         np.testing.assert_array_equal(view.color, expected.color)

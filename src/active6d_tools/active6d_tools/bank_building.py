@@ -12,7 +12,7 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator, weights_path
 from active6d_perception.scene.observed_surface import SurfaceGrid
 from active6d_perception.scene.verification import Verifier
-from active6d_sim.rendering.sensor import SensorNoise
+from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import SPLITS, find_scene, load_scene
 
@@ -57,7 +57,7 @@ def observe_scene_by_name(name: str, *, estimator: str, noise: float, seed: int)
     object_name, kind, number = name.split("/")
     model = load_object(object_name)
     scene = find_scene(object_name, "", int(number)) if kind == "seed" else find_scene(object_name, name, 0)
-    simulator = Simulator(scene, noise=SensorNoise().scaled(noise), seed=seed)
+    simulator = Simulator(scene, noise=ActiveStereo().scaled(noise), seed=seed)
     return observe_scene(
         name,
         scene.T_world_object,

@@ -1,9 +1,11 @@
 """Simulation of heaps: identical objects fall into a bin by rigid-body physics until they are at rest."""
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from active6d_core.files import atomic_file, cache_folder
@@ -12,6 +14,7 @@ from active6d_core.se3 import transform_from_quaternion
 from active6d_sim.physics.bullet import BulletClient, connect, decompose, pybullet
 from active6d_sim.rendering.renderer import visible_fractions
 from active6d_sim.scenes.scene import Bin, Scene
+from active6d_sim.scenes.surroundings import Surroundings
 
 #: An object belongs to the ground truth if some view of the grid shows at least this share of its silhouette.
 VISIBILITY_THRESHOLD = 0.1
@@ -48,16 +51,52 @@ def simulate_heap(
     if count < 1:
         raise ValueError(f"a heap needs at least one object, got count={count}")
     bin = bin or Bin.for_model(model)
-    T_world_all = _simulate(model, bin, count, rng)
-    name = name or f"{model.name}/seed/{seed}"
-    everything = Scene(model.name, name, seed, T_world_all, bin, np.zeros((0, len(T_world_all))))
+    T_world_all, _ = settle(model, bin, count, rng)
+    return labelled_scene(model, name or f"{model.name}/seed/{seed}", seed, T_world_all, bin)
+
+
+def labelled_scene(
+    model: ObjectModel,
+    name: str,
+    seed: int,
+    T_world_all: np.ndarray,
+    bin: Bin,
+    surroundings: Surroundings | None = None,
+) -> Scene:
+    """A scene whose ground truth are those of the objects that some view of the grid shows enough of.
+
+    Args:
+        model: the object.
+        name: of the scene.
+        seed: of its simulation.
+        T_world_all: (n, 4, 4) poses of all objects, metres.
+        bin: that they lie in.
+        surroundings: other things.
+    """
+    everything = Scene(
+        model.name, name, seed, T_world_all, bin, np.zeros((0, len(T_world_all))), surroundings=surroundings
+    )
     fractions = visible_fractions(everything, model)
     seen = fractions.max(axis=0, initial=0.0) >= VISIBILITY_THRESHOLD
-    return Scene(model.name, name, seed, T_world_all[seen], bin, fractions[:, seen], T_world_all[~seen])
+    return Scene(model.name, name, seed, T_world_all[seen], bin, fractions[:, seen], T_world_all[~seen], surroundings)
 
 
-def _simulate(model: ObjectModel, bin: Bin, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(k, 4, 4) ``T_world_object`` of the objects at rest in the bin; k is ``count`` unless some fall out twice."""
+def settle(
+    model: ObjectModel, bin: Bin, count: int, rng: np.random.Generator, others: Sequence[trimesh.Trimesh] = ()
+) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+    """Let objects and other things fall into a bin, and wait until they are at rest.
+
+    Args:
+        model: the object.
+        bin: that they fall into.
+        count: number of objects.
+        rng: random generator of poses and order.
+        others: meshes of other things, metres; their convex hulls collide.
+
+    Returns:
+        (k, 4, 4) ``T_world_object`` of the objects that stayed in the bin, all but those that fell out twice, and
+        (4, 4) ``T_world_thing`` by index of the others that stayed.
+    """
     client = connect()
     try:
         client.setGravity(0, 0, -9.81)
@@ -70,35 +109,53 @@ def _simulate(model: ObjectModel, bin: Bin, count: int, rng: np.random.Generator
             deterministicOverlappingPairs=1,
         )
         table = _add_bin(client, bin)
+        shape = client.createCollisionShape(pybullet.GEOM_MESH, fileName=str(collision_file(model)))
+        falling = [(shape, model.diameter)] * count + [_hull(client, mesh) for mesh in others]
+        order = [int(i) for i in rng.permutation(len(falling))] if others else list(range(count))
+        number: dict[int, int] = {}  # in ``falling``, by body
         bodies: list[int] = []
         for _ in range(_ROUNDS):
             guides = _add_walls(client, bin, bottom=bin.wall_height, top=bin.wall_height + 2.0)
-            bodies += _drop(client, model, bin, count - len(bodies), bodies, rng)
+            present = {number[body] for body in bodies}
+            missing = [i for i in order if i not in present]
+            dropped = _drop(client, [falling[i] for i in missing], bin, bodies, rng)
+            number |= dict(zip(dropped, missing, strict=True))
+            bodies += dropped
             _settle(client, bodies)
             for guide in guides:
                 client.removeBody(guide)
             _settle(client, bodies)
             bodies = _remove_fallen(client, bodies, table)
-            if len(bodies) == count:
+            if len(bodies) == len(falling):
                 break
             _settle(client, bodies)
-        poses = [client.getBasePositionAndOrientation(body) for body in _remove_fallen(client, bodies, table)]
+        poses = {number[b]: client.getBasePositionAndOrientation(b) for b in _remove_fallen(client, bodies, table)}
     finally:
         client.disconnect()
-    positions, quaternions = np.array([p for p, _ in poses]), np.array([q for _, q in poses])
-    return transform_from_quaternion(quaternions.reshape(-1, 4), positions.reshape(-1, 3))
+    T = {i: transform_from_quaternion(np.array(turn), np.array(position)) for i, (position, turn) in poses.items()}
+    objects = [T[i] for i in T if i < count]
+    return np.array(objects).reshape(-1, 4, 4), {i - count: T[i] for i in T if i >= count}
+
+
+def _hull(client: BulletClient, mesh: trimesh.Trimesh) -> tuple[int, float]:
+    """The collision shape of a thing's convex hull, and the diameter of its bounding sphere, metres."""
+    vertices = mesh.convex_hull.vertices
+    shape = client.createCollisionShape(pybullet.GEOM_MESH, vertices=vertices.tolist())
+    return shape, float(2 * np.linalg.norm(vertices, axis=1).max())
 
 
 def _drop(
-    client: BulletClient, model: ObjectModel, bin: Bin, count: int, present: list[int], rng: np.random.Generator
+    client: BulletClient, falling: Sequence[tuple[int, float]], bin: Bin, present: list[int], rng: np.random.Generator
 ) -> list[int]:
-    """Release ``count`` instances one after another just above those ``present``, so that all arrive slowly."""
-    shape = client.createCollisionShape(pybullet.GEOM_MESH, fileName=str(collision_file(model)))
-    reach = np.maximum(np.array([bin.inner_width, bin.inner_depth]) / 2 - model.diameter / 2, 0.0)
+    """Release bodies one after another just above those ``present``, so that all arrive slowly.
+
+    ``falling`` has the collision shape and the diameter of each.
+    """
     bodies: list[int] = []
-    for _ in range(count):
+    for shape, diameter in falling:
+        reach = np.maximum(np.array([bin.inner_width, bin.inner_depth]) / 2 - diameter / 2, 0.0)
         tops = [client.getAABB(body)[1][2] for body in present + bodies]
-        height = max([bin.wall_height, *tops]) + 0.6 * model.diameter
+        height = max([bin.wall_height, *tops]) + 0.6 * diameter
         position, quaternion = [*rng.uniform(-reach, reach), height], Rotation.random(rng=rng).as_quat()
         body = client.createMultiBody(_MASS, shape, basePosition=position, baseOrientation=quaternion)
         client.changeDynamics(body, -1, spinningFriction=2e-4, angularDamping=0.1, **_CONTACT)

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
+from active6d_sim.rendering.surface_print import SurfacePrint, random_colors
+
 TEXTURE_SIZE = 512
 
 
@@ -29,7 +31,10 @@ class Appearance:
         fill_color: colour of that light times its strength.
         ambient_color: colour of ambient light, which is weaker in crevices.
         backdrop: colour above the horizon.
-        seed: seed of the instances' tints and of the textures.
+        highlight_exponent: sharpness of highlights on objects.
+        metalness: share of the light that objects mirror, tinted by their colour; 0 for paint, plastic and paper.
+        printed: share of the things that have prints; all objects have the same print, unless it is 0.
+        seed: seed of the instances' tints, the textures and the prints.
     """
 
     object_color: tuple[float, float, float] | None = None
@@ -45,6 +50,9 @@ class Appearance:
     fill_color: tuple[float, float, float] = (0.13, 0.16, 0.20)
     ambient_color: tuple[float, float, float] = (0.34, 0.36, 0.40)
     backdrop: tuple[float, float, float] = (0.62, 0.67, 0.72)
+    highlight_exponent: float = 48.0
+    metalness: float = 0.0
+    printed: float = 0.0
     seed: int = 0
 
     @classmethod
@@ -73,6 +81,36 @@ class Appearance:
             backdrop=tuple(rng.uniform(0.1, 0.9, 3)),
             seed=int(rng.integers(2**31)),
         )
+
+    @classmethod
+    def wild(cls, rng: np.random.Generator) -> "Appearance":
+        """Random lights, any colours, prints, and surfaces from matt to metal, for training data and wild scenes."""
+        plain = cls.random(rng)
+        return replace(
+            plain,
+            object_color=tuple(float(value) for value in random_colors(rng, 1)[0]) if rng.random() < 0.75 else None,
+            bin_color=tuple(float(value) for value in random_colors(rng, 1)[0]),
+            table_color=tuple(float(value) for value in random_colors(rng, 1)[0]),
+            grain=tuple(np.exp(rng.uniform(np.log(0.8), np.log(12.0), 2))),
+            shininess=rng.uniform(0.0, 0.9) ** 2,
+            highlight_exponent=float(np.exp(rng.uniform(np.log(8.0), np.log(200.0)))),
+            metalness=rng.uniform(0.4, 1.0) if rng.random() < 0.15 else 0.0,
+            printed=rng.uniform(0.2, 0.8) if rng.random() < 0.75 else 0.0,
+        )
+
+    def prints(self, objects: int, things: int) -> dict[int, SurfacePrint]:
+        """Prints by index, of ``objects`` objects and of the ``things`` after them; all objects have the same."""
+        rng = np.random.default_rng([self.seed, 4])
+        if self.printed == 0:
+            return {}
+        own = SurfacePrint.random(rng)
+        of_things = np.flatnonzero(rng.random(things) < self.printed)
+        return dict.fromkeys(range(objects), own) | {objects + int(i): SurfacePrint.random(rng) for i in of_things}
+
+    def lamps(self) -> np.ndarray:
+        """(4, 3) float32 unit directions of lamps that metal mirrors."""
+        directions = np.random.default_rng([self.seed, 5]).normal(size=(4, 3)) + (0.0, 0.0, 0.7)
+        return (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
 
     def with_seed(self, seed: int) -> "Appearance":
         """The same appearance with other tints and textures."""

@@ -10,26 +10,24 @@ from functools import cached_property
 
 import numpy as np
 import open3d as o3d
-import trimesh
-from numpy.typing import ArrayLike
 
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, pixel_rays
 from active6d_core.object_model import ObjectModel, load_object
-from active6d_core.se3 import invert, transform_points
+from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
-from active6d_sim.rendering.appearance import TEXTURE_SIZE, Appearance
-from active6d_sim.scenes.scene import Bin, Scene
+from active6d_sim.rendering.appearance import Appearance
+from active6d_sim.rendering.shading import Shader, SurfacePoints
+from active6d_sim.rendering.triangle_soup import (
+    BACKDROP,
+    FIRST_OBJECT,
+    TRAY,
+    TriangleSoup,
+    build_soup,
+)
+from active6d_sim.scenes.scene import Scene
 
-_TABLE_HALF_WIDTH = 2.5
-_FADE_START = 0.8
-_TEXEL = 0.002
-_SHARP_EDGE = np.radians(40.0)
 _OCCLUSION_RAYS = 48
 _OCCLUSION_REACH = 0.25
-#: (4096,) linear light in [0, 1] to sRGB bytes.
-_TO_SRGB = np.round(255 * np.linspace(0.0, 1.0, 4096) ** (1 / 2.2)).astype(np.uint8)
-
-_BACKDROP, _TABLE, _TRAY, _FIRST_INSTANCE = range(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +42,8 @@ class RenderedView:
             camera; zero without surface.
         object_coordinates: (H, W, 3) float32 surface points in the frame of the pixel's object, metres, zero elsewhere;
             None where they were not asked for.
+        albedo: (H, W) float32 diffuse reflectance in [0, 1], 0 without surface; None without colour.
+        gloss: (H, W) float32 strength of mirror-like reflection in [0, 1], 0 without surface; None without colour.
     """
 
     color: np.ndarray | None
@@ -51,23 +51,8 @@ class RenderedView:
     instance: np.ndarray
     normals: np.ndarray
     object_coordinates: np.ndarray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Soup:
-    """All triangles of a scene.
-
-    Attributes:
-        vertices: (v, 3) float32, world.
-        normals: (v, 3) float32 unit normals, world.
-        faces: (f, 3) uint32.
-        material: (f,) int16, ``_TABLE``, ``_TRAY`` or ``_FIRST_INSTANCE + instance``.
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    material: np.ndarray
+    albedo: np.ndarray | None = None
+    gloss: np.ndarray | None = None
 
 
 class SceneRenderer:
@@ -76,7 +61,7 @@ class SceneRenderer:
     Args:
         scene: the scene to render.
         model: its object; loaded by the scene's ``object_name`` when None.
-        appearance: colours and lights; the default appearance when None.
+        appearance: colours and lights; when None the default one, or one of the scene's own if it has surroundings.
         appearance_seed: seed of tints and textures if ``appearance`` is None.
         threads: number of threads of the ray caster, 0 for one per core.
     """
@@ -92,16 +77,26 @@ class SceneRenderer:
     ) -> None:
         self.scene = scene
         self.model = model or load_object(scene.object_name)
-        self._look = appearance or Appearance(seed=appearance_seed)
         self._threads = threads
         self._T_object_world = invert(scene.T_world_all).astype(np.float32)
-        self._soup = soup = _build_soup(self.model.mesh, scene)
+        self._soup = soup = build_soup(self.model.mesh, scene)
         self._caster = o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._caster.add_triangles(soup.vertices, soup.faces)
         # The last row is for rays that hit nothing.
         self._corner_normals = np.concatenate([soup.normals[soup.faces], np.zeros((1, 3, 3), np.float32)])
         self._face_normals = np.ascontiguousarray(self._corner_normals[:, 0])
-        self._material = np.append(soup.material, np.int16(_BACKDROP))
+        self._material = np.append(soup.material, np.int16(BACKDROP))
+        self._first_thing = FIRST_OBJECT + len(scene.T_world_all)
+        self.dress(appearance or default_appearance(scene, appearance_seed))
+
+    def dress(self, appearance: Appearance) -> None:
+        """Change colours and lights of the views that follow; the geometry stays."""
+        radius = float(np.linalg.norm(self.model.mesh.vertices, axis=1).max())
+        self._shader = Shader(self.scene, self.model.color, radius, appearance, self._in_shadow)
+
+    def _in_shadow(self, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
+        rays = _rays(points, np.broadcast_to(towards, points.shape))
+        return self._caster.test_occlusions(rays, nthreads=self._threads).numpy()
 
     def render(
         self,
@@ -126,29 +121,38 @@ class SceneRenderer:
         hit = np.isfinite(depth)
         points = eye + directions * np.where(hit, depth, 0)[:, None]
         material = self._material[face]
-        on_object = np.flatnonzero(material >= _FIRST_INSTANCE)
+        solid = np.flatnonzero(material >= FIRST_OBJECT)
         weights = _barycentric(uv)
-        normals = self._interpolate_normals(face, weights, on_object)
-        away = on_object[np.einsum("ij,ij->i", normals[on_object], directions[on_object]) > 0]
+        normals = self._interpolate_normals(face, weights, solid)
+        away = solid[np.einsum("ij,ij->i", normals[solid], directions[solid]) > 0]
         normals[away] *= -1
         shape = (camera.height, camera.width)
-        color = None
+        color = albedo = gloss = None
         if shaded:
             openness = np.einsum("ij,ij->i", weights, self._openness[face])
-            color = self._shade(points, normals, openness, material, directions).reshape(*shape, 3)
+            shading = self._shader.shade(SurfacePoints(points, normals, openness, material, directions))
+            color = shading.color.reshape(*shape, 3)
+            albedo, gloss = np.where(hit, shading.albedo, 0).reshape(shape), shading.gloss.reshape(shape)
         coordinates = None
         if object_coordinates:
-            T = self._T_object_world[material[on_object] - _FIRST_INSTANCE]
+            on_object = solid[material[solid] < self._first_thing]
+            T = self._T_object_world[material[on_object] - FIRST_OBJECT]
             coordinates = np.zeros_like(points)
             coordinates[on_object] = np.einsum("pij,pj->pi", T[:, :3, :3], points[on_object]) + T[:, :3, 3]
             coordinates = coordinates.reshape(*shape, 3)
         return RenderedView(
             color,
             np.where(hit, depth, np.float32(np.nan)).reshape(shape),
-            np.maximum(material - _FIRST_INSTANCE, -1).astype(np.int16).reshape(shape),
+            self._instance(material).astype(np.int16).reshape(shape),
             (normals @ R).reshape(*shape, 3),
             coordinates,
+            albedo,
+            gloss,
         )
+
+    def _instance(self, material: np.ndarray) -> np.ndarray:
+        """Index of the object of each material, -1 for others."""
+        return np.where((material >= FIRST_OBJECT) & (material < self._first_thing), material - FIRST_OBJECT, -1)
 
     def instance_layers(self, T_world_camera: np.ndarray, camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
         """Count the pixels of each object: those that are visible, and those if it were rendered alone.
@@ -165,9 +169,9 @@ class SceneRenderer:
         eye = np.asarray(T_world_camera[:3, 3], np.float32)
         first = self._material[self._cast(eye, directions)[1]]
         # Nothing lies behind the table or the backdrop, so a ray that reaches them has met no object.
-        directions, first = directions[first >= _TRAY], first[first >= _TRAY].astype(int) - _FIRST_INSTANCE
+        directions, first = directions[first >= TRAY], self._instance(first[first >= TRAY].astype(int))
         crossings = self._caster.list_intersections(_rays(eye, directions), nthreads=self._threads)
-        crossed = self._material[crossings["primitive_ids"].numpy()].astype(int) - _FIRST_INSTANCE
+        crossed = self._instance(self._material[crossings["primitive_ids"].numpy()].astype(int))
         silhouettes = np.zeros((count, len(directions)), bool)
         silhouettes[crossed[crossed >= 0], crossings["ray_ids"].numpy()[crossed >= 0]] = True
         return np.bincount(first[first >= 0], minlength=count), silhouettes.sum(axis=1)
@@ -177,6 +181,11 @@ class SceneRenderer:
         directions = (points - eye).astype(np.float32)
         # A hit at parameter 1 is the point itself; 0.1 % are allowed for rounding.
         return self._cast(eye.astype(np.float32), directions)[0] > 0.999
+
+    def surface_height(self, xy: np.ndarray) -> np.ndarray:
+        """(p,) world z of the highest surface at (p, 2) world x and y, metres; ``-inf`` beside everything."""
+        above = np.column_stack([xy, np.full(len(xy), 10.0)]).astype(np.float32)
+        return above[:, 2] - self._cast(above, np.broadcast_to(np.float32([0, 0, -1]), above.shape))[0]
 
     def _cast(self, eye: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(p,) ray parameter, (p,) face and (p, 2) barycentric coordinates of first hits; misses get the extra face.
@@ -193,93 +202,20 @@ class SceneRenderer:
         openness = _ambient_openness(self._caster, self._soup, self._threads)
         return np.concatenate([openness[self._soup.faces], np.zeros((1, 3), np.float32)])
 
-    @cached_property
-    def _textures(self) -> np.ndarray:
-        """(2, texels) brightness factors of the table and of the tray."""
-        return self._look.textures().reshape(2, -1)
-
-    @cached_property
-    def _palette(self) -> np.ndarray:
-        """(materials, 3) linear colour of each material."""
-        fixed = np.array([self._look.backdrop, self._look.table_color, self._look.bin_color], np.float32)
-        instances = self._look.instance_colors(len(self.scene.T_world_all), self.model.color)
-        return np.concatenate([fixed, instances])
-
-    def _interpolate_normals(self, face: np.ndarray, weights: np.ndarray, on_object: np.ndarray) -> np.ndarray:
-        """(p, 3) unit normals at barycentric (p, 3) ``weights`` of the faces, smooth for the rays ``on_object``."""
+    def _interpolate_normals(self, face: np.ndarray, weights: np.ndarray, solid: np.ndarray) -> np.ndarray:
+        """(p, 3) unit normals at barycentric (p, 3) ``weights`` of the faces, smooth for the ``solid`` rays."""
         normals = self._face_normals[face]
-        smooth = np.einsum("ij,ijk->ik", weights[on_object], self._corner_normals[face[on_object]])
+        smooth = np.einsum("ij,ijk->ik", weights[solid], self._corner_normals[face[solid]])
         smooth /= np.maximum(np.sqrt(np.einsum("ij,ij->i", smooth, smooth)), 1e-6)[:, None]
-        normals[on_object] = smooth
+        normals[solid] = smooth
         return normals
 
-    def _shade(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        openness: np.ndarray,
-        material: np.ndarray,
-        directions: np.ndarray,
-    ) -> np.ndarray:
-        """(p, 3) uint8 sRGB from ambient light with occlusion, a fill light, and a key light with hard shadows."""
-        look = self._look
-        key, fill = (_unit(direction) for direction in (look.key_direction, look.fill_direction))
-        facing_key = normals @ key
-        lit = np.flatnonzero((facing_key > 0) & (material != _BACKDROP))
-        offset = points[lit] + 5e-4 * normals[lit]
-        towards_key = _rays(offset, np.broadcast_to(key, offset.shape))
-        lit = lit[~self._caster.test_occlusions(towards_key, nthreads=self._threads).numpy()]
-        texture = self._texture(points, material)
-        strengths = np.zeros((len(points), 3), np.float32)
-        strengths[lit, 0] = facing_key[lit] * texture[lit]
-        texture *= openness
-        strengths[:, 1] = texture * (0.75 + 0.25 * normals[:, 2])
-        strengths[:, 2] = texture * np.maximum(normals @ fill, 0)
-        light = strengths @ np.array([look.key_color, look.ambient_color, look.fill_color], np.float32)
-        light *= self._palette[material]
-        self._add_highlights(light, lit, normals, material, directions, key)
-        self._paint_backdrop(light, points, material, directions)
-        light *= len(_TO_SRGB) - 1
-        return _TO_SRGB[np.minimum(light, len(_TO_SRGB) - 1, out=light).astype(np.int16)]
 
-    def _texture(self, points: np.ndarray, material: np.ndarray) -> np.ndarray:
-        """(p,) brightness factor; walls take their texture along x + z and y + z, so that no UV map is needed."""
-        factor = np.ones(len(points), np.float32)
-        ground = np.flatnonzero((material == _TABLE) | (material == _TRAY))
-        x, y, z = points[ground].T
-        row, column = (((along + z) / _TEXEL).astype(np.int32) % TEXTURE_SIZE for along in (y, x))
-        layer = (material[ground] == _TRAY).astype(np.int32)
-        factor[ground] = self._textures[layer, row * TEXTURE_SIZE + column]
-        return factor
-
-    def _add_highlights(
-        self,
-        light: np.ndarray,
-        lit: np.ndarray,
-        normals: np.ndarray,
-        material: np.ndarray,
-        directions: np.ndarray,
-        key: np.ndarray,
-    ) -> None:
-        """Add Blinn-Phong highlights of the key light on objects."""
-        glossy = lit[material[lit] >= _FIRST_INSTANCE]
-        view = -directions[glossy]
-        half = view / np.linalg.norm(view, axis=1, keepdims=True) + key
-        half /= np.linalg.norm(half, axis=1, keepdims=True)
-        strength = self._look.shininess * np.maximum(np.einsum("ij,ij->i", normals[glossy], half), 0) ** 48
-        light[glossy] += strength[:, None] * np.array(self._look.key_color, np.float32)
-
-    def _paint_backdrop(
-        self, light: np.ndarray, points: np.ndarray, material: np.ndarray, directions: np.ndarray
-    ) -> None:
-        """Paint a plain backdrop, into which the table fades with distance."""
-        backdrop = np.array(self._look.backdrop, np.float32)
-        light[material == _BACKDROP] = backdrop
-        table = np.flatnonzero(material == _TABLE)
-        away = np.hypot(points[table, 0], points[table, 1])
-        far = away > _FADE_START
-        fade = np.minimum((away[far] - _FADE_START) / (_TABLE_HALF_WIDTH - _FADE_START), 1)[:, None]
-        light[table[far]] += fade * (backdrop - light[table[far]])
+def default_appearance(scene: Scene, seed: int) -> Appearance:
+    """The default colours and lights of a bin on an empty table; random ones, by its seed, of a wild scene."""
+    if scene.surroundings is None:
+        return Appearance(seed=seed)
+    return Appearance.wild(np.random.default_rng([scene.seed, seed, 3]))
 
 
 def visible_fractions(
@@ -315,69 +251,7 @@ def _rays(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return rays
 
 
-def _unit(vector: tuple[float, float, float]) -> np.ndarray:
-    return (np.array(vector) / np.linalg.norm(vector)).astype(np.float32)
-
-
-def _build_soup(mesh: trimesh.Trimesh, scene: Scene) -> _Soup:
-    smooth = trimesh.graph.smooth_shade(mesh, angle=_SHARP_EDGE)
-    vertices, normals, faces = np.asarray(smooth.vertices), np.asarray(smooth.vertex_normals), np.asarray(smooth.faces)
-    parts = [_table(scene.bin), *_tray(scene.bin)]
-    kinds = [_TABLE] + [_TRAY] * (len(parts) - 1)
-    for T in scene.T_world_all:
-        parts.append((transform_points(T, vertices), normals @ T[:3, :3].T, faces))
-        kinds.append(len(kinds) - len(_tray(scene.bin)) - 1 + _FIRST_INSTANCE)
-    offsets = np.cumsum([0] + [len(part[0]) for part in parts])
-    return _Soup(
-        np.concatenate([part[0] for part in parts]).astype(np.float32),
-        np.concatenate([part[1] for part in parts]).astype(np.float32),
-        np.concatenate([part[2] + offset for part, offset in zip(parts, offsets[:-1], strict=True)]).astype(np.uint32),
-        np.repeat(np.array(kinds, np.int16), [len(part[2]) for part in parts]),
-    )
-
-
-def _patch(
-    origin: ArrayLike, along_u: ArrayLike, along_v: ArrayLike, rows: np.ndarray, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A rectangle of quads at fractions ``rows`` and ``columns`` of its sides; its normal is u x v."""
-    origin, along_u, along_v = (np.array(value, float) for value in (origin, along_u, along_v))
-    v, u = np.meshgrid(rows, columns, indexing="ij")
-    vertices = origin + u.reshape(-1, 1) * along_u + v.reshape(-1, 1) * along_v
-    corner = (np.arange(len(rows) - 1)[:, None] * len(columns) + np.arange(len(columns) - 1)).ravel()
-    right, above, across = corner + 1, corner + len(columns), corner + len(columns) + 1
-    faces = np.concatenate([np.stack([corner, right, across], 1), np.stack([corner, across, above], 1)])
-    normal = np.cross(along_u, along_v)
-    return vertices, np.broadcast_to(normal / np.linalg.norm(normal), vertices.shape), faces
-
-
-def _table(bin: Bin) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The table; its mesh is fine near the bin, where ambient occlusion changes."""
-    reach = min(1.5 * max(bin.inner_width, bin.inner_depth) / _TABLE_HALF_WIDTH, 0.9)
-    lines = np.concatenate([[0.0], 0.5 + 0.5 * reach * np.linspace(-1, 1, 64), [1.0]])
-    width = 2 * _TABLE_HALF_WIDTH
-    return _patch((-width / 2, -width / 2, -bin.wall_thickness), (width, 0, 0), (0, width, 0), lines, lines)
-
-
-def _tray(bin: Bin) -> list:
-    """The bin's floor, and the inside, outside and rim of each of its four walls."""
-    half_x, half_y, thick, top = bin.inner_width / 2, bin.inner_depth / 2, bin.wall_thickness, bin.wall_height
-    fine, coarse, single = np.linspace(0, 1, 48), np.linspace(0, 1, 10), np.linspace(0, 1, 2)
-    patches = [_patch((-half_x, -half_y, 0), (2 * half_x, 0, 0), (0, 2 * half_y, 0), fine, fine)]
-    corners = np.array([[-half_x, -half_y], [half_x, -half_y], [half_x, half_y], [-half_x, half_y]])
-    outward = np.sign(corners) * thick
-    for start, end in ((0, 1), (1, 2), (2, 3), (3, 0)):
-        inner_a, inner_b = corners[start], corners[end]
-        outer_a, outer_b = inner_a + outward[start], inner_b + outward[end]
-        inside, outside = np.append(inner_b - inner_a, 0), np.append(outer_b - outer_a, 0)
-        if top > 0:
-            patches.append(_patch((*inner_b, 0), -inside, (0, 0, top), coarse, fine))
-        patches.append(_patch((*outer_a, -thick), outside, (0, 0, top + thick), coarse, fine))
-        rim_width = np.append(np.sign(inner_a + inner_b) * thick, 0)
-        patches.append(_patch((*outer_a, top), outside, -rim_width, single, fine))
-    return patches
-
-
-def _ambient_openness(caster: o3d.t.geometry.RaycastingScene, soup: _Soup, threads: int) -> np.ndarray:
+def _ambient_openness(caster: o3d.t.geometry.RaycastingScene, soup: TriangleSoup, threads: int) -> np.ndarray:
     """(v,) cosine-weighted share of the hemisphere above each vertex that is free within ``_OCCLUSION_REACH``."""
     rng = np.random.default_rng(0)
     sphere = rng.normal(size=(_OCCLUSION_RAYS, 3)).astype(np.float32)

@@ -10,7 +10,7 @@ from active6d_core.registry import Registry
 from active6d_sim.rendering.renderer import RenderedView
 
 #: The sensor that active6d was developed with.
-DEFAULT_SENSOR = "active-stereo"
+DEFAULT_SENSOR = "active_stereo"
 
 
 class Sensor(Protocol):
@@ -28,7 +28,10 @@ class Sensor(Protocol):
 
 
 _registry = Registry(
-    "sensor", lambda object_name: DEFAULT_SENSOR, {DEFAULT_SENSOR: "active6d_sim.rendering.sensor"}, "active6d.sensors"
+    "sensor",
+    lambda object_name: DEFAULT_SENSOR,
+    {name: f"active6d_sim.rendering.{name}" for name in (DEFAULT_SENSOR, "structured_light", "time_of_flight")},
+    "active6d.sensors",
 )
 #: Decorates a factory ``(model, **parameters) -> Sensor``; see :meth:`active6d_core.registry.Registry.register`.
 register_sensor = _registry.register

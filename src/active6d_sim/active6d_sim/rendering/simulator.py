@@ -5,8 +5,8 @@ import numpy as np
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View
 from active6d_core.se3 import is_rigid
 from active6d_core.view_sphere import ViewSphere
+from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.renderer import RenderedView, SceneRenderer
-from active6d_sim.rendering.sensor import SensorNoise
 from active6d_sim.rendering.sensor_registry import Sensor
 from active6d_sim.scenes.scene import Scene
 
@@ -21,7 +21,7 @@ class Simulator:
     """An RGB-D camera that can take a view from any pose in a scene."""
 
     def __init__(
-        self, scene: Scene, camera: PinholeCamera = DEFAULT_CAMERA, noise: Sensor = SensorNoise(), seed: int = 0
+        self, scene: Scene, camera: PinholeCamera = DEFAULT_CAMERA, noise: Sensor = ActiveStereo(), seed: int = 0
     ) -> None:
         """
         Args:

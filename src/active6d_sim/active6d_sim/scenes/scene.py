@@ -7,6 +7,7 @@ import numpy as np
 
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import is_rigid
+from active6d_sim.scenes.surroundings import Surroundings
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Scene:
         visible_fraction: (M, n) share of each object's silhouette seen from each view of the default grid, in [0, 1].
         T_world_hidden: (h, 4, 4) poses of objects that are simulated and rendered, but do not belong to the ground
             truth because no view of the grid shows enough of them.
+        surroundings: other things; None for a bin on an empty table.
 
     Raises:
         ValueError: shapes disagree or a pose is not rigid.
@@ -64,6 +66,7 @@ class Scene:
     bin: Bin
     visible_fraction: np.ndarray
     T_world_hidden: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    surroundings: Surroundings | None = None
 
     def __post_init__(self) -> None:
         for poses in (self.T_world_object, self.T_world_hidden):
@@ -83,6 +86,7 @@ class Scene:
 
     def save(self, path: Path) -> None:
         """Write the scene as one compressed ``.npz`` without pickled data."""
+        around = {} if self.surroundings is None else self.surroundings.arrays()
         np.savez_compressed(
             path,
             object_name=self.object_name,
@@ -92,6 +96,7 @@ class Scene:
             T_world_hidden=self.T_world_hidden,
             bin=[self.bin.inner_width, self.bin.inner_depth, self.bin.wall_height, self.bin.wall_thickness],
             visible_fraction=self.visible_fraction.astype(np.float32),
+            **{f"surroundings_{name}": value for name, value in around.items()},
         )
 
     @classmethod
@@ -103,6 +108,7 @@ class Scene:
         """
         try:
             with np.load(path, allow_pickle=False) as data:
+                around = {name.removeprefix("surroundings_"): data[name] for name in data if name.startswith("surr")}
                 return cls(
                     str(data["object_name"]),
                     str(data["name"]),
@@ -111,6 +117,7 @@ class Scene:
                     Bin(*data["bin"].tolist()),
                     data["visible_fraction"],
                     data["T_world_hidden"],
+                    Surroundings.from_arrays(around) if around else None,
                 )
         except Exception as error:  # NumPy raises many kinds of errors on damaged archives
             raise ValueError(f"{path}: not a stored scene ({error})") from error

@@ -1,4 +1,4 @@
-"""Stored scenes: 40 heaps per object in fixed splits for training, validation and test.
+"""Stored scenes: 40 heaps per object in fixed splits for training, validation and test, and 16 wild scenes.
 
 The seed of a stored scene is ``SPLIT_SEEDS[split] + index``. The scenes are shipped as small ``.npz`` files, so that
 evaluations use the same heaps with every version of the physics engine.
@@ -18,10 +18,11 @@ from active6d_core.object_model import list_objects, load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.physics.heap import collision_file, simulate_heap
 from active6d_sim.scenes.scene import Scene
+from active6d_sim.scenes.wild_scene import wild_scene
 
-#: Scenes per split: 30 for training (6 of them for validation) and 10 for test, as in the paper.
-SPLITS = {"train": 24, "val": 6, "test": 10}
-SPLIT_SEEDS = {"train": 100_000, "val": 200_000, "test": 300_000}
+#: Scenes per split: 30 for training (6 of them for validation) and 10 for test, as in the paper; and wild scenes.
+SPLITS = {"train": 24, "val": 6, "test": 10, "wild_val": 6, "wild_test": 10}
+SPLIT_SEEDS = {"train": 100_000, "val": 200_000, "test": 300_000, "wild_val": 400_000, "wild_test": 500_000}
 #: Heaps that are simulated on demand have smaller seeds than this, so that none of them is a stored one.
 FIRST_STORED_SEED = min(SPLIT_SEEDS.values())
 
@@ -106,7 +107,8 @@ def generate(
 
 
 def _store_scene(object_name: str, split: str, index: int, path: Path) -> Path:
-    scene = simulate_heap(load_object(object_name), SPLIT_SEEDS[split] + index, name=f"{object_name}/{split}/{index}")
+    simulate = wild_scene if split.startswith("wild") else simulate_heap
+    scene = simulate(load_object(object_name), SPLIT_SEEDS[split] + index, name=f"{object_name}/{split}/{index}")
     with atomic_file(path) as unfinished:
         replace(scene, visible_fraction=np.round(scene.visible_fraction, 3)).save(unfinished)
     return path

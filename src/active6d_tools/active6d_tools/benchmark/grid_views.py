@@ -9,8 +9,8 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.single_view_evaluation import LabelledView
+from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.renderer import RenderedView, SceneRenderer
-from active6d_sim.rendering.sensor import SensorNoise
 from active6d_sim.rendering.simulator import NANOSECONDS, Simulator
 from active6d_sim.scenes.scene import Scene
 
@@ -44,7 +44,7 @@ class GridViews:
             seen = feature_seen(self._simulator.renderer, self._part, T_world_camera)
             self._rendered = (index, number), rendered, seen
         _, rendered, seen = self._rendered
-        view = self._simulator.sense(rendered, T_world_camera, (number + 1) * NANOSECONDS, SensorNoise().scaled(noise))
+        view = self._simulator.sense(rendered, T_world_camera, (number + 1) * NANOSECONDS, ActiveStereo().scaled(noise))
         return LabelledView(view, scene.T_world_object, scene.visible_fraction[number], seen)
 
 

@@ -105,7 +105,7 @@ def show(
 
     from active6d_core.object_model import load_object
     from active6d_core.view_sphere import ViewSphere
-    from active6d_sim.rendering.sensor import SensorNoise
+    from active6d_sim.rendering.active_stereo import ActiveStereo
     from active6d_sim.rendering.simulator import Simulator
     from active6d_sim.scenes.scene_store import find_scene
     from active6d_tools.report.drawing import depth_to_color
@@ -121,7 +121,7 @@ def show(
     load_object(object_name)
     with messages.status("simulating and rendering"):
         scene = find_scene(object_name, "" if kind == "seed" else scene_name, int(number) if kind == "seed" else seed)
-        simulator = Simulator(scene, noise=SensorNoise().scaled(noise), seed=seed)
+        simulator = Simulator(scene, noise=ActiveStereo().scaled(noise), seed=seed)
         columns = []
         for index in views:
             image = simulator.capture(sphere.pose(sphere.positions[index]), (index + 1) * 1_000_000_000)

@@ -23,10 +23,14 @@ _DATA = "Folder of the views and checkpoints; by default active6d/training/OBJEC
 def estimator(
     object_name: ObjectName,
     data: Annotated[Path | None, typer.Option(metavar="DIR", help=_DATA)] = None,
-    heaps: Annotated[int, typer.Option(help="Number of simulated piles to render views of.", min=1)] = 110,
-    views: Annotated[int, typer.Option(help="Number of views per pile.", min=1)] = 32,
+    heaps: Annotated[int, typer.Option(help="Number of simulated scenes to render views of.", min=1)] = 110,
+    views: Annotated[int, typer.Option(help="Number of views per scene.", min=1)] = 32,
     steps: Annotated[int, typer.Option(help="Number of optimiser steps.", min=1)] = 5_500,
     batch: Annotated[int, typer.Option(help="Batch size in views.", min=1)] = 8,
+    rate: Annotated[float, typer.Option(help="Highest learning rate.", min=0.0)] = 2e-3,
+    start: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Start from these weights; by default from random ones.")
+    ] = None,
     run: Annotated[
         str, typer.Option(help="Name of the training; an interrupted training of that name is continued.")
     ] = "run",
@@ -49,6 +53,7 @@ def estimator(
     from active6d_core.files import cache_folder
     from active6d_core.object_model import load_object
     from active6d_perception.estimators.dense.training.loop import TrainingOptions
+    from active6d_perception.estimators.dense.training.losses import LossWeights
     from active6d_tools.training_data import render_missing
 
     model = load_object(object_name)
@@ -63,7 +68,10 @@ def estimator(
         shards = render_missing(object_name, folder, heaps, views, cores, on_progress)
     if render_only:
         return
-    best, history = _train(model, shards, folder / run, TrainingOptions(steps=steps, batch=batch, seed=seed), cores)
+    options = TrainingOptions(
+        steps=steps, batch=batch, learning_rate=rate, seed=seed, start=str(start or ""), loss=LossWeights(coordinates=0)
+    )
+    best, history = _train(model, shards, folder / run, options, cores)
     if export is not None:
         export_weights(best, export, object_name)
     write_json(json_file, {"object": object_name, "weights": str(best), "validation": history})
@@ -79,10 +87,11 @@ def _train(
 
     from active6d_perception.estimators.dense.training.loop import Report, train
     from active6d_perception.estimators.dense.training.samples import read_shard
+    from active6d_tools.training_data import VALIDATION_SPLITS
 
     torch.set_num_threads(cores)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    validation = [sample for path in shards["validation"] for sample in read_shard(path)]
+    validation = [sample for split in VALIDATION_SPLITS for path in shards[split] for sample in read_shard(path)]
     with progress_bar() as bar:
         task = bar.add_task(f"{model.name}: training on {device}", total=options.steps)
 

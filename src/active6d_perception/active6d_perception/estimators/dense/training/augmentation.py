@@ -10,11 +10,19 @@ from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE
 
 
 def augment(view: View, rng: np.random.Generator) -> View:
-    """Change colour balance, exposure, contrast and image noise; add noise to depth and remove some of it."""
+    """Change colour balance, exposure, contrast and image noise; add noise to depth and remove some of it.
+
+    Colour helps and must not decide: a fifth of the views have mixed channels, a fifth are grey, a fifth have none.
+    """
     color = view.color.astype(np.float32) / 255
     color = color ** rng.uniform(0.7, 1.4) * rng.uniform(0.75, 1.25) * rng.uniform(0.85, 1.15, 3).astype(np.float32)
-    if rng.random() < 0.15:
+    draw = rng.random()
+    if draw < 0.2:
+        color = color @ rng.dirichlet(np.ones(3), 3).astype(np.float32).T
+    elif draw < 0.4:
         color = np.broadcast_to(color.mean(axis=-1, keepdims=True), color.shape)
+    elif draw < 0.6:
+        color = np.full(color.shape, rng.uniform(0.2, 0.8), np.float32)
     color = color + rng.normal(0, rng.uniform(0, 0.03), color.shape).astype(np.float32)
     depth = view.depth + rng.normal(0, rng.uniform(0, 0.001), view.depth.shape).astype(np.float32)
     depth[_blobs(view.depth.shape, rng)] = np.nan
@@ -22,7 +30,9 @@ def augment(view: View, rng: np.random.Generator) -> View:
 
 
 def crop(sample: TrainingView, height: int, width: int, rng: np.random.Generator) -> TrainingView:
-    """Cut a window around a random object pixel. Most of a view shows the table, from which little is learned.
+    """Cut a window around a random object pixel, or by chance (a quarter) any pixel.
+
+    Most of a view shows the table, from which little is learned, but what is no object must be seen as well.
 
     Args:
         sample: training view at the network's input resolution; a smaller one is returned whole.
@@ -31,7 +41,10 @@ def crop(sample: TrainingView, height: int, width: int, rng: np.random.Generator
         rng: random generator.
     """
     on_object = np.argwhere(sample.instance >= 0)
-    centre = on_object[rng.integers(len(on_object))] if len(on_object) else np.array(sample.instance.shape) // 2
+    if len(on_object) and rng.random() < 0.75:
+        centre = on_object[rng.integers(len(on_object))]
+    else:
+        centre = rng.integers(0, sample.instance.shape)
     size = np.minimum((height, width), sample.view.depth.shape) // OUTPUT_STRIDE
     top, left = np.clip(centre - size // 2, 0, np.array(sample.instance.shape) - size)
     coarse = slice(top, top + size[0]), slice(left, left + size[1])

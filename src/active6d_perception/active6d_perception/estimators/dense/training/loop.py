@@ -26,8 +26,9 @@ from active6d_perception.estimators.dense.network import (
     DenseNetwork,
     NetworkSize,
     has_fast_bfloat16,
+    split,
 )
-from active6d_perception.estimators.dense.trained_network import TrainedNetwork, save_network
+from active6d_perception.estimators.dense.trained_network import TrainedNetwork, load_network, save_network
 from active6d_perception.estimators.dense.training.batches import TrainingViews, batches
 from active6d_perception.estimators.dense.training.curves import draw_curves
 from active6d_perception.estimators.dense.training.losses import LossWeights, loss_terms, total
@@ -51,6 +52,7 @@ class TrainingOptions:
         validate_every: steps between validations, a multiple of ``checkpoint_every``.
         workers: number of processes that prepare batches.
         seed: seed of initial weights, order and augmentation.
+        start: path of trained weights to start from instead of random ones; empty for random ones.
         loss: weights of the terms of the loss.
         size: channels of the network's layers.
 
@@ -68,6 +70,7 @@ class TrainingOptions:
     validate_every: int = 1000
     workers: int = 1
     seed: int = 0
+    start: str = ""
     loss: LossWeights = field(default_factory=LossWeights)
     size: NetworkSize = field(default_factory=NetworkSize)
 
@@ -124,7 +127,7 @@ def train(
     """
     folder.mkdir(parents=True, exist_ok=True)
     canonical_frame = canonical_frame_of(model)
-    run = _Run(folder, options, device)
+    run = _Run(model, folder, options, device)
     feed = batches(
         TrainingViews(list(shards), canonical_frame, model.diameter, (options.seed, run.step)),
         options.batch,
@@ -165,10 +168,12 @@ def worth(validation: dict[str, float]) -> float:
 class _Run:
     """State of a training: network, averaged network, optimiser and history, with the file that holds them."""
 
-    def __init__(self, folder: Path, options: TrainingOptions, device: str) -> None:
+    def __init__(self, model: ObjectModel, folder: Path, options: TrainingOptions, device: str) -> None:
         torch.manual_seed(options.seed)
         self._options, self._device = options, torch.device(device)
         network: Any = DenseNetwork(options.size, HEADS if options.loss.coordinates else DEPLOYED_HEADS)
+        if options.start:
+            _start_from(network, load_network(Path(options.start), model).network)
         self._network: DenseNetwork = network.to(self._device, memory_format=torch.channels_last).train()
         self._averaged = AveragedModel(self._network, avg_fn=partial(_average, options.averaging), use_buffers=True)
         # The scheduler reads the initial rate from here when it goes on with a training.
@@ -236,6 +241,25 @@ class _Run:
             raise ValueError(
                 f"{self._state_file}: cannot resume this training ({reason}); give another folder or delete it"
             ) from error
+
+
+def _start_from(network: DenseNetwork, trained: DenseNetwork) -> None:
+    """Copy weights; heads that only one of the networks has are left out.
+
+    Raises:
+        ValueError: the networks have layers of other sizes.
+    """
+    weights = trained.state_dict()
+    own = network.state_dict()
+    rows = split(torch.arange(sum(trained.heads.values()))[None])
+    kept = torch.cat([rows[name][0] for name in network.heads if name in rows])
+    if network.heads.keys() <= trained.heads.keys():
+        for name in ("answer.1.weight", "answer.1.bias"):
+            weights[name] = weights[name][kept]
+    try:
+        network.load_state_dict(own | weights)
+    except RuntimeError as error:
+        raise ValueError(f"cannot start from these weights: {str(error).splitlines()[-1].strip()}") from error
 
 
 def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
