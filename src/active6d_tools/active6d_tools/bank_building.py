@@ -8,11 +8,12 @@ from active6d_agent.bank.scene_bank import BankScene, SceneBank, observe_scene
 from active6d_core.files import sha256_of
 from active6d_core.metrics import DETECTION_FRACTION
 from active6d_core.object_model import load_object
+from active6d_core.registry import AUTOMATIC
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator, weights_path
 from active6d_perception.scene.observed_surface import SurfaceGrid
 from active6d_perception.scene.verification import Verifier
-from active6d_sim.rendering.active_stereo import ActiveStereo
+from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import SPLITS, find_scene, load_scene
 
@@ -52,12 +53,12 @@ def bank_provenance(object_name: str, estimator: str, noise: float, seed: int) -
     return provenance
 
 
-def observe_scene_by_name(name: str, *, estimator: str, noise: float, seed: int) -> BankScene:
+def observe_scene_by_name(name: str, *, estimator: str, noise: float, seed: int, sensor: str = AUTOMATIC) -> BankScene:
     """Observe one scene from every view with the deployed estimator and verification; runs in its own process."""
     object_name, kind, number = name.split("/")
     model = load_object(object_name)
     scene = find_scene(object_name, "", int(number)) if kind == "seed" else find_scene(object_name, name, 0)
-    simulator = Simulator(scene, noise=ActiveStereo().scaled(noise), seed=seed)
+    simulator = Simulator(scene, noise=sensor_of(sensor, model, scene).scaled(noise), seed=seed)
     return observe_scene(
         name,
         scene.T_world_object,

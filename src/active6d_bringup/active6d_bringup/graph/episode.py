@@ -63,6 +63,7 @@ class EpisodeSettings:
         steps: budget of moves T.
         metres: budget of metres along the hemisphere, None without one.
         estimator: name of the estimator, None for the params file's.
+        sensor: name of the simulated camera's sensor model; auto for the default one, or a random one in a wild scene.
         bag: folder to create for the recording, None for no recording.
         processes: every node in a process of its own.
         params_file: ROS parameters; None takes those of this package.
@@ -79,6 +80,7 @@ class EpisodeSettings:
     steps: int = 5
     metres: float | None = None
     estimator: str | None = None
+    sensor: str = "auto"
     bag: Path | None = None
     processes: bool = False
     params_file: Path | None = None
@@ -185,6 +187,8 @@ def describe(settings: EpisodeSettings) -> GraphDescription:
     camera: dict[str, Any] = {"object": settings.object, "seed": settings.seed}
     if settings.scene is not None:
         camera["scene"] = settings.scene
+    if settings.sensor != "auto":
+        camera["sensor"] = settings.sensor
     policy: dict[str, Any] = {
         "object": settings.object,
         "seed": settings.seed,

@@ -15,6 +15,8 @@ MSSD_THRESHOLDS = np.arange(1, 11) * 0.05
 MSPD_THRESHOLDS = np.arange(1, 11) * 5.0
 _RECALL_STEPS = np.linspace(0.0, 1.0, 101)
 _RESAMPLES = 2000
+#: Number of bins of the score in :func:`reliability`.
+CALIBRATION_BINS = 10
 
 
 def bootstrapped(hits: np.ndarray, counts: np.ndarray, groups: Sequence) -> dict[str, float | int | None]:
@@ -126,6 +128,46 @@ def area_under_curve(score: np.ndarray, right: np.ndarray) -> float | None:
     if right.all() or not right.any():
         return None
     return float(mannwhitneyu(score[right], score[~right]).statistic / (right.sum() * (~right).sum()))
+
+
+def calibration_error(score: np.ndarray, right: np.ndarray) -> float | None:
+    """Expected calibration error of probabilities: the mean difference between score and share of right poses.
+
+    Guo et al., "On Calibration of Modern Neural Networks" (2017), with :data:`CALIBRATION_BINS` bins of equal width.
+
+    Args:
+        score: (h,) in [0, 1].
+        right: (h,) bool.
+
+    Returns:
+        The error in [0, 1], None without hypotheses.
+    """
+    bins = reliability(score, right)
+    total = sum(row["hypotheses"] for row in bins)
+    if not total:
+        return None
+    return sum(row["hypotheses"] * abs(row["score"] - row["right"]) for row in bins) / total
+
+
+def reliability(score: np.ndarray, right: np.ndarray) -> list[dict[str, float]]:
+    """Mean score and share of right poses by bins of the score; empty bins are left out.
+
+    Args:
+        score: (h,) in [0, 1].
+        right: (h,) bool.
+    """
+    number = np.minimum((score * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
+    rows = []
+    for bin in np.unique(number):
+        chosen = number == bin
+        rows.append(
+            {
+                "hypotheses": int(chosen.sum()),
+                "score": float(score[chosen].mean()),
+                "right": float(right[chosen].mean()),
+            }
+        )
+    return rows
 
 
 def rank_correlation(score: np.ndarray, error: np.ndarray) -> float | None:

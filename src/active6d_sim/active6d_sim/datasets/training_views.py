@@ -11,15 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View
 from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.registry import AUTOMATIC
 from active6d_core.se3 import invert, look_at, make_transform
 from active6d_core.training_view import TrainingView
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.physics.heap import simulate_heap
 from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.appearance import Appearance
-from active6d_sim.rendering.depth_sensor import DepthSensor
-from active6d_sim.rendering.random_sensor import random_sensor
+from active6d_sim.rendering.random_sensor import random_sensor, sensor_of
 from active6d_sim.rendering.renderer import SceneRenderer
+from active6d_sim.rendering.sensor_registry import Sensor
 from active6d_sim.scenes.scene import Bin, Scene
 from active6d_sim.scenes.scene_store import load_scene
 from active6d_sim.scenes.wild_scene import wild_pile
@@ -148,22 +149,15 @@ def validation_views(
     renderer = SceneRenderer(scene, model=load_object(object_name), appearance_seed=scene.seed, threads=threads)
     rng, sphere = np.random.default_rng(scene.seed), ViewSphere()
     for view in rng.choice(len(sphere), count, replace=False):
-        sensor = scene_sensor(scene, int(view))
+        sensor = sensor_of(AUTOMATIC, renderer.model, scene, int(view))
         yield _capture(renderer, DEFAULT_CAMERA, sphere.pose(sphere.positions[view]), sensor, rng, truth_scale)
-
-
-def scene_sensor(scene: Scene, view: int) -> DepthSensor:
-    """The sensor that sees a view of a stored scene: the default one, or of a wild scene a random one by its seed."""
-    if scene.surroundings is None:
-        return ActiveStereo()
-    return random_sensor(np.random.default_rng([scene.seed, view, 11]))
 
 
 def _capture(
     renderer: SceneRenderer,
     camera: PinholeCamera,
     T_world_camera: np.ndarray,
-    sensor: DepthSensor,
+    sensor: Sensor,
     rng: np.random.Generator,
     truth_scale: float,
 ) -> TrainingView:

@@ -7,9 +7,11 @@ from std_srvs.srv import Trigger
 
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.object_model import load_object
+from active6d_core.registry import AUTOMATIC
 from active6d_core.ros.runner import run_node
 from active6d_sim.nodes.moving_camera import MovingCameraNode
-from active6d_sim.rendering.sensor_registry import DEFAULT_SENSOR, create_sensor, list_sensors
+from active6d_sim.rendering.random_sensor import sensor_of
+from active6d_sim.rendering.sensor_registry import list_sensors
 from active6d_sim.rendering.simulator import Simulator, admit_goal
 from active6d_sim.scenes.scene_store import SPLITS, find_scene
 
@@ -21,7 +23,8 @@ class CameraSimulatorNode(MovingCameraNode):
         super().__init__("camera_simulator", **options)
         self.declare("scene", "", "name of a stored scene such as mug/test/3; empty: a new pile simulated by the seed")
         self.declare("snap_to_grid", True, "go to the grid's view nearest to a goal instead of exactly to the goal")
-        self.declare("sensor", DEFAULT_SENSOR, "sensor model of the simulated camera", choices=list_sensors())
+        sensors = [AUTOMATIC, *list_sensors()]
+        self.declare("sensor", AUTOMATIC, "sensor model; auto: active_stereo, in wild scenes random", choices=sensors)
         self.declare("noise_scale", 1.0, "factor on the sensor noise; 0: no noise", minimum=0.0)
         self.declare("width", 640, "image width in pixels", minimum=16, maximum=4096)
         self.declare("height", 480, "image height in pixels", minimum=16, maximum=4096)
@@ -32,8 +35,6 @@ class CameraSimulatorNode(MovingCameraNode):
         """Simulate or load the scene."""
         super().setup()
         self.check_start_view(len(self.sphere))
-        sensor = create_sensor(self.value("sensor"), load_object(self.object_name))
-        self._sensor = sensor.scaled(self.value("noise_scale"))
         self._camera = PinholeCamera.from_field_of_view(
             self.value("width"), self.value("height"), self.value("field_of_view")
         )
@@ -41,7 +42,8 @@ class CameraSimulatorNode(MovingCameraNode):
 
     def _load(self, scene_name: str, seed: int) -> None:
         scene = find_scene(self.object_name, scene_name, seed)
-        self._simulator = Simulator(scene, self._camera, self._sensor, self.seed)
+        sensor = sensor_of(self.value("sensor"), load_object(self.object_name), scene)
+        self._simulator = Simulator(scene, self._camera, sensor.scaled(self.value("noise_scale")), self.seed)
 
     @property
     def scene_name(self) -> str:

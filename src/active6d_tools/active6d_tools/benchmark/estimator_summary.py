@@ -13,9 +13,11 @@ from active6d_perception.estimators.detection_rates import (
     area_under_curve,
     average_precision,
     bootstrapped,
+    calibration_error,
     rank_correlation,
     recall_at_precision,
     recalls,
+    reliability,
     thresholds,
 )
 from active6d_perception.estimators.single_view_evaluation import EstimatorResult
@@ -30,6 +32,8 @@ FEATURE_SEEN = 0.15
 CROWDED = 14
 #: Recall is given at the score thresholds with these precisions.
 PRECISIONS = (0.95, 0.98)
+#: Hypotheses with at least this score count as reported.
+SURE = 0.5
 #: A rotation about the axis is right within this many degrees.
 SAME_TURN = 30.0
 
@@ -44,7 +48,8 @@ def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> 
 
     Returns:
         The results by name. For an object with a part that can be hidden (the mug's handle), ``precision`` and
-        ``average_precision.pose`` use ADD-S, because a view may not show the rotation about the axis.
+        ``average_precision.pose`` use ADD-S, because a view may not show the rotation about the axis. The calibration
+        error is by ADD, as the score is the probability that the whole pose is right.
     """
     by = "adds" if model.features else "add"
     row: dict[str, Any] = _detection(result, scenes)
@@ -54,6 +59,13 @@ def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> 
         hits = np.array([(view.match(kind, result.limit) >= 0).sum() for view in result.views])
         row[f"precision_{kind}"] = bootstrapped(hits, np.array([len(view.score) for view in result.views]), scenes)
     row["precision"] = row[f"precision_{by}"]
+    sure = [view.score >= SURE for view in result.views]
+    hits = np.array(
+        [(view.match(by, result.limit)[chosen] >= 0).sum() for view, chosen in zip(result.views, sure, strict=True)]
+    )
+    row["precision_at_half"] = bootstrapped(hits, np.array([chosen.sum() for chosen in sure]), scenes)
+    row["reliability"] = reliability(result.gather("score"), result.right())
+    row["calibration_error"] = calibration_error(result.gather("score"), result.right())
     row["average_precision"] = {"pose": average_precision(result.views, by, [result.limit])}
     row["recall_at_precision"] = {
         str(least): recall_at_precision(result.views, by, result.limit, least) for least in PRECISIONS
@@ -72,6 +84,17 @@ def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> 
     if model.features:
         row["ambiguity"] = ambiguity_study(result)
     return row
+
+
+def headline(row: dict[str, Any]) -> dict[str, Any]:
+    """The rates that most readers of the JSON want, from a row of :func:`summarise`."""
+    return {
+        **{kind: {least: row[kind][least]["rate"] for least in map(str, VISIBLE)} for kind in ("add", "adds")},
+        "precision": row["precision"]["rate"],
+        "precision_at_half": row["precision_at_half"]["rate"],
+        "calibration_error": row["calibration_error"],
+        "ms_median": row["time"]["all"]["total"]["median_ms"],
+    }
 
 
 def _detection(result: EstimatorResult, scenes: Sequence, feature_seen: float | None = None) -> dict[str, Any]:

@@ -11,12 +11,13 @@ import numpy as np
 
 from active6d_core.files import sha256_of
 from active6d_core.object_model import ObjectModel, load_object
+from active6d_core.registry import AUTOMATIC
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import Estimator, create_estimator, weights_path
 from active6d_perception.estimators.single_view_evaluation import EstimatorResult, detection_over_views, evaluate_view
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.scenes.scene_store import SPLITS, load_scene
-from active6d_tools.benchmark.estimator_summary import summarise
+from active6d_tools.benchmark.estimator_summary import headline, summarise
 from active6d_tools.benchmark.grid_views import GridViews
 from active6d_tools.benchmark.peers import PEERS
 from active6d_tools.benchmark.records import Records
@@ -60,7 +61,7 @@ def enlist(
     Args:
         model: of the object.
         estimators: names of registered ones.
-        weights: of ``dense``; the shipped ones if None.
+        weights: of ``dense``; the shipped ones if empty. Further ones are contenders named after their file.
         peers: whether to add those of :mod:`~active6d_tools.benchmark.peers`.
 
     Raises:
@@ -69,9 +70,10 @@ def enlist(
     contenders = []
     for name in dict.fromkeys(estimators):
         if name == "dense":
-            path = weights or weights_path(model.name)
-            estimator = create_estimator(name, model, weights=str(path))
-            contenders.append(Contender(name, f"{name} {sha256_of(path)[:12]}", estimator))
+            for number, path in enumerate(weights or [weights_path(model.name)]):
+                estimator = create_estimator(name, model, weights=str(path))
+                label = f"{name} {path.stem}" if number else name
+                contenders.append(Contender(label, f"{name} {sha256_of(path)[:12]}", estimator))
         else:
             contenders.append(Contender(name, name, create_estimator(name, model)))
     if peers:
@@ -88,6 +90,7 @@ def measure_estimators(
     moves: int = 0,
     seed: int = 0,
     noises: Sequence[float] = (1.0,),
+    sensor: str = AUTOMATIC,
     records: Path | None = None,
     on_progress: OnProgress = lambda what, done, total: None,
 ) -> Measurement:
@@ -102,6 +105,7 @@ def measure_estimators(
             for no walks. Peers have no walks.
         seed: of the sample, the walks and the sensor noise.
         noises: factors on the sensor noise; 0 switches it off.
+        sensor: name of the sensor; ``auto`` is the default one, or in wild scenes a random one in each view.
         records: file of results of single views; existing results are used, new ones are appended.
         on_progress: called with a description, the number of steps done and the number of all steps.
 
@@ -112,11 +116,12 @@ def measure_estimators(
         raise ValueError(f"unknown split '{split}'; known: {', '.join(SPLITS)}")
     model = load_object(object_name)
     scenes = [load_scene(object_name, split, index) for index in range(SPLITS[split])]
-    store = Records(records, {"object": object_name, "split": split, "seed": seed})
+    header = {"object": object_name, "split": split, "seed": seed}
+    store = Records(records, header if sensor == AUTOMATIC else {**header, "sensor": sensor})
     rng = np.random.default_rng(seed)
     pairs = _draw_views(rng, len(scenes), sample)
     walks = [[int(view) for view in rng.permutation(len(ViewSphere()))[: moves + 1]] for _ in scenes]
-    views = GridViews(model, scenes, seed)
+    views = GridViews(model, scenes, seed, sensor)
     results = _measure_views(contenders, views, pairs, noises, store, on_progress)
     rows = _summarise_all(model, results, [scene for scene, _ in pairs])
     done = len(pairs) * len(results)
@@ -130,7 +135,11 @@ def measure_estimators(
         "split": split,
         "views": len(pairs),
         "seed": seed,
-        "estimators": {contender.name: contender.identity for contender in contenders},
+        "sensor": sensor,
+        "estimators": {
+            contender.name: {"identity": contender.identity, **headline(rows[f"{noises[0]:g}"][contender.name])}
+            for contender in contenders
+        },
         "peak_memory_mib": _peak_memory_mib(),
         "noise": rows,
     }

@@ -6,10 +6,11 @@ import numpy as np
 
 from active6d_core.camera import DEFAULT_CAMERA, project
 from active6d_core.object_model import ObjectModel
+from active6d_core.registry import AUTOMATIC
 from active6d_core.se3 import invert, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.single_view_evaluation import LabelledView
-from active6d_sim.rendering.active_stereo import ActiveStereo
+from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.renderer import RenderedView, SceneRenderer
 from active6d_sim.rendering.simulator import NANOSECONDS, Simulator
 from active6d_sim.scenes.scene import Scene
@@ -20,14 +21,15 @@ _FEATURE_SAMPLES = 400
 class GridViews:
     """Captures what :class:`.Simulator` would; holds one scene's triangles at a time."""
 
-    def __init__(self, model: ObjectModel, scenes: Sequence[Scene], seed: int) -> None:
+    def __init__(self, model: ObjectModel, scenes: Sequence[Scene], seed: int, sensor: str = AUTOMATIC) -> None:
         """
         Args:
             model: the scenes' object.
             scenes: by index.
             seed: of sensor noise and appearance.
+            sensor: name of the sensor; ``auto`` is the default one, and in a wild scene another one in each view.
         """
-        self.model, self.scenes, self._seed = model, scenes, seed
+        self.model, self.scenes, self._seed, self._sensor = model, scenes, seed, sensor
         self._sphere = ViewSphere()
         self._simulator: Simulator | None = None
         self._rendered: tuple[tuple[int, int], RenderedView, np.ndarray] | None = None
@@ -44,7 +46,8 @@ class GridViews:
             seen = feature_seen(self._simulator.renderer, self._part, T_world_camera)
             self._rendered = (index, number), rendered, seen
         _, rendered, seen = self._rendered
-        view = self._simulator.sense(rendered, T_world_camera, (number + 1) * NANOSECONDS, ActiveStereo().scaled(noise))
+        sensor = sensor_of(self._sensor, self.model, scene, number).scaled(noise)
+        view = self._simulator.sense(rendered, T_world_camera, (number + 1) * NANOSECONDS, sensor)
         return LabelledView(view, scene.T_world_object, scene.visible_fraction[number], seen)
 
 

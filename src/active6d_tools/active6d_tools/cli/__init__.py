@@ -57,17 +57,19 @@ class CommandGroup(TyperGroup):
 
 
 class PartsCommand(TyperCommand):
-    """A command whose help names all policies or estimators where its texts say {policies} or {estimators}."""
+    """A command whose help names all parts where its texts say {policies}, {estimators} or {sensors}."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Fill in the names, which are found only now: finding them imports the packages."""
         from active6d_agent.policies.registry import list_policies
         from active6d_perception.estimators.registry import list_estimators
+        from active6d_sim.rendering.sensor_registry import list_sensors
 
+        kinds = {"{policies}": list_policies, "{estimators}": list_estimators, "{sensors}": list_sensors}
         options: list[Any] = self.params
         for parameter in options:
             text = getattr(parameter, "help", None) or ""
-            for kind, names in (("{policies}", list_policies), ("{estimators}", list_estimators)):
+            for kind, names in kinds.items():
                 if kind in text:
                     parameter.help = text.replace(kind, ", ".join(names()))
         super().format_help(ctx, formatter)

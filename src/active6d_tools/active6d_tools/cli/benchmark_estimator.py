@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from active6d_tools.cli.options import JsonFile, ObjectName, Seed, Split
+from active6d_tools.cli.options import JsonFile, ObjectName, Seed, SensorName, Split
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
@@ -24,6 +24,10 @@ def estimator(
     ] = None,
     peers: Annotated[bool, typer.Option("--peers", help="Also measure PPF and FPFH with RANSAC (slow).")] = False,
     split: Split = "test",
+    wild: Annotated[
+        bool, typer.Option("--wild", help="Take the wild scenes of the split: other things, containers and sensors.")
+    ] = False,
+    sensor: SensorName = "auto",
     sample: Annotated[int | None, typer.Option(min=1, help="Number of views, sampled with --seed.")] = None,
     noise: Annotated[
         list[float] | None,
@@ -31,7 +35,11 @@ def estimator(
     ] = None,
     moves: Annotated[int, typer.Option(min=0, help="Also fuse the views of this many moves in each scene.")] = 0,
     weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Weights of the dense estimator instead of the shipped ones.")
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Weights of the dense estimator instead of the shipped ones; repeatable, to compare them.",
+        ),
     ] = None,
     records: Annotated[
         Path | None, typer.Option(metavar="FILE", help="File for the results of all views; a run continues from it.")
@@ -42,6 +50,8 @@ def estimator(
 ) -> None:
     """Measure detection rate, precision, score quality and time of estimators on single views.
 
+    Wild scenes are in the splits wild_val and wild_test; --wild --split test means the latter.
+
     Example: [bold]active6d benchmark estimator --object mug --sample 50 --plots plots --json mug.json[/bold]
     """
     from active6d_core.object_model import load_object
@@ -49,11 +59,13 @@ def estimator(
     from active6d_tools.benchmark.estimator_views import enlist, measure_estimators
 
     model = load_object(object_name)
+    if wild and not split.startswith("wild_"):
+        split = f"wild_{split}"
     # The dense estimator needs weights of the object.
-    able = [name for name in list_estimators() if name != "dense" or (weights or weights_path(object_name)).is_file()]
+    able = [name for name in list_estimators() if name != "dense" or weights or weights_path(object_name).is_file()]
     with progress_bar() as progress:
         task = progress.add_task("loading", total=None)
-        contenders = enlist(model, names or able, weights=weights, peers=peers)
+        contenders = enlist(model, names or able, weights=weights or [], peers=peers)
         measured = measure_estimators(
             object_name,
             split,
@@ -62,6 +74,7 @@ def estimator(
             moves=moves,
             seed=seed,
             noises=tuple(dict.fromkeys(noise or [1.0])),
+            sensor=sensor,
             records=records,
             on_progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
         )
@@ -129,6 +142,8 @@ def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
 
 
 def _quality(rows: dict[str, dict[str, Any]], part: str) -> Iterator[Detail]:
+    yield "precision at score ≥ 0.5", _interval, ("precision_at_half",)
+    yield "calibration error", _number, ("calibration_error",)
     for kind in ("mssd", "mspd"):
         yield f"average recall, {kind.upper()}", _interval, (kind, "average_recall")
     for least in next(iter(rows.values()))["recall_at_precision"]:

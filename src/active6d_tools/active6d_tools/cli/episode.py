@@ -13,6 +13,7 @@ from active6d_tools.cli.options import (
     ParamsFile,
     Processes,
     Seed,
+    SensorName,
     parse_overrides,
 )
 from active6d_tools.cli.output import write_json, write_reports
@@ -36,6 +37,7 @@ def episode(
         str | None,
         typer.Option(metavar="NAME", help="Stored scene, such as mug/test/3, instead of a pile simulated with --seed."),
     ] = None,
+    sensor: SensorName = "auto",
     bag: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Record every topic to a bag in this new folder.")
     ] = None,
@@ -72,6 +74,7 @@ def episode(
             steps=steps,
             metres=metres,
             estimator=estimator,
+            sensor=sensor,
             bag=bag,
             processes=processes,
             params_file=params_file,
@@ -99,11 +102,13 @@ def _check_names(settings: "EpisodeSettings") -> None:
     from active6d_core.object_model import load_object
     from active6d_core.registry import AUTOMATIC
     from active6d_perception.estimators.registry import list_estimators
+    from active6d_sim.rendering.sensor_registry import list_sensors
 
     load_object(settings.object)
     for option, value, known in (
         ("--policy", settings.policy, [AUTOMATIC, *list_policies()]),
         ("--estimator", settings.estimator, [AUTOMATIC, *list_estimators()]),
+        ("--sensor", settings.sensor, [AUTOMATIC, *list_sensors()]),
     ):
         if value is not None and value not in known:
             raise ValueError(f"{option} '{value}' is not among {', '.join(known)}")

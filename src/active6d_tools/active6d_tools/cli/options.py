@@ -24,7 +24,10 @@ PolicyParameters = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="POLICY.NAME=VALUE", help="Set a parameter of a policy; repeatable."),
 ]
-Split = Annotated[str, typer.Option(help="Split of the scenes: train, val or test.")]
+Split = Annotated[str, typer.Option(help="Split of the scenes: train, val, test, wild_val or wild_test.")]
+SensorName = Annotated[
+    str, typer.Option("--sensor", help="Sensor model: auto (active_stereo, in wild scenes random), {sensors}.")
+]
 Banks = Annotated[
     Path | None,
     typer.Option("--banks", metavar="DIR", help="Folder of the banks; by default active6d/banks in the cache folder."),

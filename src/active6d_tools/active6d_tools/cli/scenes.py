@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from active6d_tools.cli.options import JsonFile, ObjectName, Seed, Split
+from active6d_tools.cli.options import JsonFile, ObjectName, Seed, SensorName, Split
 from active6d_tools.cli.output import write_json, write_png
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
@@ -94,6 +94,7 @@ def show(
         list[int] | None,
         typer.Option(min=0, help="Number of a view of the grid; repeatable. By default four views around the bin."),
     ] = None,
+    sensor: SensorName = "auto",
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the noise of the simulated sensor.")] = 1.0,
     seed: Seed = 0,
 ) -> None:
@@ -105,7 +106,7 @@ def show(
 
     from active6d_core.object_model import load_object
     from active6d_core.view_sphere import ViewSphere
-    from active6d_sim.rendering.active_stereo import ActiveStereo
+    from active6d_sim.rendering.random_sensor import sensor_of
     from active6d_sim.rendering.simulator import Simulator
     from active6d_sim.scenes.scene_store import find_scene
     from active6d_tools.report.drawing import depth_to_color
@@ -118,10 +119,10 @@ def show(
     if len(parts) != 3 or not parts[2].isdecimal():
         raise ValueError(f"scene '{scene_name}' is not of the form mug/test/3 or mug/seed/7")
     object_name, kind, number = parts
-    load_object(object_name)
+    model = load_object(object_name)
     with messages.status("simulating and rendering"):
         scene = find_scene(object_name, "" if kind == "seed" else scene_name, int(number) if kind == "seed" else seed)
-        simulator = Simulator(scene, noise=ActiveStereo().scaled(noise), seed=seed)
+        simulator = Simulator(scene, noise=sensor_of(sensor, model, scene).scaled(noise), seed=seed)
         columns = []
         for index in views:
             image = simulator.capture(sphere.pose(sphere.positions[index]), (index + 1) * 1_000_000_000)
