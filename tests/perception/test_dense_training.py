@@ -204,14 +204,18 @@ def test_truth_of_another_size_is_refused(mug_view):
 
 
 def test_augmentation_keeps_the_truth_and_never_mirrors(mug_view):
-    view = mug_view[0].view
-    for seed in range(5):
+    view, colorless = mug_view[0].view, 0
+    for seed in range(30):
         changed = augment(view, np.random.default_rng(seed))
         both = np.isfinite(changed.depth) & np.isfinite(view.depth)
         assert both.mean() > 0.8
         assert np.abs(changed.depth - view.depth)[both].max() < 0.008
         gray, before = changed.color.mean(axis=-1).ravel(), view.color.mean(axis=-1).ravel()
-        assert np.corrcoef(gray, before)[0, 1] > 0.9
+        if gray.std() < 10:  # no colour but noise
+            colorless += 1
+        else:
+            assert np.corrcoef(gray, before)[0, 1] > 0.85
+    assert 2 <= colorless <= 12  # a fifth
 
 
 def test_a_crop_has_the_targets_of_the_whole(mug_view):
@@ -365,11 +369,11 @@ def test_the_learning_rate_of_a_resumed_training_follows_the_schedule(tmp_path, 
         train(load_object("mug"), [folder / "views.npz"], [mug_view[0]], tmp_path, options, on_step=interrupt)
     expected = [2e-3 * min(1, (step + 1) / 5) * 0.5 * (1 + np.cos(np.pi * step / 8)) for step in (0, 3)]
     for where, rate in zip((tmp_path / "none", tmp_path), expected, strict=True):
-        assert _Run(where, options, "cpu")._optimizer.param_groups[0]["lr"] == pytest.approx(rate)
+        assert _Run(load_object("mug"), where, options, "cpu")._optimizer.param_groups[0]["lr"] == pytest.approx(rate)
 
 
 def test_averaged_weights_follow_the_current_ones(mug_view, tmp_path):
-    run = _Run(tmp_path, quick(warmup=1), "cpu")
+    run = _Run(load_object("mug"), tmp_path, quick(warmup=1), "cpu")
     model = load_object("mug")
     item = mug_view[0]
     inputs = input_tensor(item.view, model.diameter)[None]
@@ -399,6 +403,20 @@ def test_a_network_without_coordinates_heads_is_trained_and_deployed(tmp_path, t
     fitted = DenseParameters(decoding=DecodingParameters(coordinates=True))
     with pytest.raises(ValueError, match="without the coordinates heads"):
         DenseEstimator(model, network, fitted).locate(sample.view)
+
+
+def test_a_training_starts_from_trained_weights(tmp_path, trained):
+    """All weights are those of the file; heads that are no longer trained are left out."""
+    start = load_network(trained[1], load_object("mug")).network
+    options = quick(start=str(trained[1]), loss=LossWeights(coordinates=0))
+    network = _Run(load_object("mug"), tmp_path, options, "cpu").averaged_on_cpu()
+    assert network.heads == DEPLOYED_HEADS
+    inputs = torch.rand(1, 16, 32, 48, generator=torch.Generator().manual_seed(0))
+    ours, theirs = (split(item.eval()(inputs)) for item in (network, start))
+    for name in DEPLOYED_HEADS:
+        assert torch.allclose(ours[name], theirs[name], atol=1e-5)
+    with pytest.raises(ValueError, match="cannot start from these weights"):
+        _Run(load_object("mug"), tmp_path / "other", quick(start=str(trained[1]), size=NetworkSize()), "cpu")
 
 
 def test_the_coordinates_heads_do_not_change_what_is_deployed(mug_view):

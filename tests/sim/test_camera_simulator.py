@@ -308,7 +308,7 @@ def test_before_it_is_active_it_says_so_and_ignores_goals(watched):
         ({"start_view": 100}, "'start_view' is 100, the last is 99"),
         ({"start_view": -2}, "'start_view' is -2, must be >= -1"),
         ({"noise_scale": -1.0}, "'noise_scale'"),
-        ({"sensor": "sonar"}, "'sensor' is 'sonar', must be one of active_stereo"),
+        ({"sensor": "sonar"}, "'sensor' is 'sonar', must be one of auto, active_stereo"),
         ({"field_of_view": 180.0}, "'field_of_view'"),
         ({"camera_speed": 0.0}, "'camera_speed'"),
         ({"seed": "seven"}, "'seed' must be a int"),
@@ -343,7 +343,7 @@ class ConstantDepth:
 
 
 def test_another_sensor_measures(watched):
-    assert list_sensors() == ["active_stereo", "constant-depth"]
+    assert list_sensors() == ["active_stereo", "constant-depth", "structured_light", "time_of_flight"]
     watched.start(sensor="constant-depth", noise_scale=3.0)
     depth = image_to_depth(watched.boxes["camera/depth/image_raw"][0])
     np.testing.assert_array_equal(depth, np.full((48, 64), 1.5, np.float32))

@@ -71,7 +71,7 @@ def test_seeds_of_stored_scenes_are_not_dropped_again(mugs, seed):
 
 def test_seeds_of_the_splits_do_not_overlap():
     ranges = [range(SPLIT_SEEDS[split], SPLIT_SEEDS[split] + count) for split, count in SPLITS.items()]
-    assert len({seed for seeds in ranges for seed in seeds}) == sum(SPLITS.values()) == 40
+    assert len({seed for seeds in ranges for seed in seeds}) == sum(SPLITS.values()) == 56
 
 
 def test_generate_makes_what_is_missing(tmp_path, monkeypatch):

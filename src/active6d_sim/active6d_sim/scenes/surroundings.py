@@ -100,8 +100,9 @@ class Surroundings:
 
 
 def extents_of(kind: str) -> np.ndarray:
-    """(3,) original sides of the bounding box of a kind that is a mesh, in the units of its file."""
-    return np.asarray(_source_mesh(kind).extents, float)
+    """(3,) original sides of the bounding box of a kind that is a mesh, in its own units; flat ones are thickened."""
+    extents = np.asarray(_source_mesh(kind).extents, float)
+    return np.maximum(extents, 0.01 * extents.max())
 
 
 @lru_cache(maxsize=256)

@@ -20,6 +20,7 @@ from active6d_sim.scenes.surroundings import FILE_KIND, OBJECT_KIND, Surrounding
 _CONTAINERS = ("tray", "carton", "tote", "none")
 _CONTAINER_SHARES = (0.25, 0.3, 0.2, 0.25)
 _FLOOR_DEPTH = (0.4, 1.0)  # metres below the table
+_DAMAGED_FILE = 168  # of pybullet_data's random_urdfs: its vertices are NaN
 _CARDBOARD = (0.42, 0.27, 0.14)
 
 
@@ -113,6 +114,7 @@ def _random_things(count: int, diameter: float, exclude: str, rng: np.random.Gen
                 size[2] = size[0]
         elif draw < 0.75 or not others:
             number = int(rng.integers(1000))
+            number -= number == _DAMAGED_FILE
             kind = f"{FILE_KIND}random_urdfs/{number:03d}/{number:03d}.obj"
             extents = extents_of(kind)
             size = extents / extents.max() * diameter * rng.uniform(0.4, 1.6)

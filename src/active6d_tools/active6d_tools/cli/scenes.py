@@ -17,7 +17,8 @@ def generate(
     object_name: ObjectName = "mug",
     into: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the stored scenes.")] = Path("scenes"),
     split: Annotated[
-        list[str] | None, typer.Option(help="Split: train, val or test; repeatable. By default all.")
+        list[str] | None,
+        typer.Option(help="Split: train, val, test, wild_val or wild_test; repeatable. By default all."),
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per core.")] = None,
 ) -> None:
