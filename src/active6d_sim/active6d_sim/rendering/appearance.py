@@ -88,9 +88,9 @@ class Appearance:
         plain = cls.random(rng)
         return replace(
             plain,
-            object_color=tuple(float(value) for value in random_colors(rng, 1)[0]) if rng.random() < 0.75 else None,
-            bin_color=tuple(float(value) for value in random_colors(rng, 1)[0]),
-            table_color=tuple(float(value) for value in random_colors(rng, 1)[0]),
+            object_color=_random_color(rng) if rng.random() < 0.75 else None,
+            bin_color=_random_color(rng),
+            table_color=_random_color(rng),
             grain=tuple(np.exp(rng.uniform(np.log(0.8), np.log(12.0), 2))),
             shininess=rng.uniform(0.0, 0.9) ** 2,
             highlight_exponent=float(np.exp(rng.uniform(np.log(8.0), np.log(200.0)))),
@@ -131,6 +131,11 @@ class Appearance:
         bin_speckle = 0.04 * _tiling_noise(rng, (1.0, 1.0))
         factors = np.stack([1 + self.table_contrast * table / 1.22, 1 + bin_speckle])
         return np.clip(factors, 0.2, 1.8).astype(np.float32)
+
+
+def _random_color(rng: np.random.Generator) -> tuple[float, float, float]:
+    red, green, blue = random_colors(rng, 1)[0].tolist()
+    return red, green, blue
 
 
 def _tiling_noise(rng: np.random.Generator, sigma: ArrayLike) -> np.ndarray:

@@ -54,6 +54,16 @@ class RenderedView:
     albedo: np.ndarray | None = None
     gloss: np.ndarray | None = None
 
+    def reflectance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Albedo and gloss.
+
+        Raises:
+            ValueError: the view was rendered without colour.
+        """
+        if self.albedo is None or self.gloss is None:
+            raise ValueError("the view was rendered without colour")
+        return self.albedo, self.gloss
+
 
 class SceneRenderer:
     """Renders one scene from any camera.
@@ -185,7 +195,7 @@ class SceneRenderer:
     def surface_height(self, xy: np.ndarray) -> np.ndarray:
         """(p,) world z of the highest surface at (p, 2) world x and y, metres; ``-inf`` beside everything."""
         above = np.column_stack([xy, np.full(len(xy), 10.0)]).astype(np.float32)
-        return above[:, 2] - self._cast(above, np.broadcast_to(np.float32([0, 0, -1]), above.shape))[0]
+        return above[:, 2] - self._cast(above, np.broadcast_to(np.array([0, 0, -1], np.float32), above.shape))[0]
 
     def _cast(self, eye: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(p,) ray parameter, (p,) face and (p, 2) barycentric coordinates of first hits; misses get the extra face.

@@ -104,7 +104,7 @@ class StructuredLight(DepthSensor):
             glare_loss=rng.uniform(0.0, 1.0),
             quantum=rng.choice([0.0001, 0.001, 0.002]),
             color=rng.uniform(0.5, 6.0),
-            misalignment=tuple(int(value) for value in rng.integers(-4, 5, 2)),
+            misalignment=(int(rng.integers(-4, 5)), int(rng.integers(-4, 5))),
         )
 
     def measure_depth(self, rendered: RenderedView, camera: PinholeCamera, rng: np.random.Generator) -> np.ndarray:
@@ -131,13 +131,14 @@ class StructuredLight(DepthSensor):
 
     def _loss(self, rendered: RenderedView, camera: PinholeCamera) -> np.ndarray:
         """(H, W) probability that a pixel has no return."""
+        albedo, gloss = rendered.reflectance()
         kept = grazing_share(rendered, camera, self.grazing_degrees, 3.0)
         kept *= 1 - self.edge_loss * at_edge(rendered.depth, self.edge_step)
         if self.dark_albedo > 0:
-            kept *= expit((np.log(np.maximum(rendered.albedo, 1e-4)) - np.log(self.dark_albedo)) / 0.3)
+            kept *= expit((np.log(np.maximum(albedo, 1e-4)) - np.log(self.dark_albedo)) / 0.3)
         if self.glare_loss > 0:
             # The projector is so near the camera that a surface mirrors it where it faces the camera.
-            kept *= 1 - self.glare_loss * rendered.gloss * np.maximum(facing(rendered, camera), 0) ** 60
+            kept *= 1 - self.glare_loss * gloss * np.maximum(facing(rendered, camera), 0) ** 60
         return 1 - kept
 
 

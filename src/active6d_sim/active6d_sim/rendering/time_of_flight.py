@@ -79,7 +79,7 @@ class TimeOfFlight(DepthSensor):
             jitter=int(rng.integers(0, 2)),
             quantum=rng.choice([0.0001, 0.0005, 0.001]),
             color=rng.uniform(0.5, 5.0),
-            misalignment=tuple(int(value) for value in rng.integers(-2, 3, 2)),
+            misalignment=(int(rng.integers(-2, 3)), int(rng.integers(-2, 3))),
         )
 
     def measure_depth(self, rendered: RenderedView, camera: PinholeCamera, rng: np.random.Generator) -> np.ndarray:
@@ -116,7 +116,8 @@ class TimeOfFlight(DepthSensor):
 
     def _amplitude(self, rendered: RenderedView, camera: PinholeCamera) -> np.ndarray:
         """(H, W) reflected light, relative to a nominal surface at the nominal distance; 0 without surface."""
-        light = rendered.albedo / _NOMINAL_ALBEDO * np.maximum(facing(rendered, camera), 0)
+        albedo, _ = rendered.reflectance()
+        light = albedo / _NOMINAL_ALBEDO * np.maximum(facing(rendered, camera), 0)
         return np.nan_to_num(light * (_NOMINAL_DISTANCE / rendered.depth) ** 2)
 
 

@@ -67,7 +67,7 @@ class Surroundings:
     def mesh(self, index: int) -> trimesh.Trimesh:
         """The mesh of thing ``index`` in its own frame, metres."""
         mesh = _unit_mesh(self.kind[index]).copy()
-        mesh.apply_scale(self.size[index])
+        mesh.apply_transform(np.diag([*self.size[index], 1.0]))
         return mesh
 
     def arrays(self) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def _unit_mesh(kind: str) -> trimesh.Trimesh:
     """
     mesh = _source_mesh(kind).copy()
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
-    mesh.apply_scale(1 / np.maximum(mesh.extents, 1e-9))
+    mesh.apply_transform(np.diag([*(1 / np.maximum(mesh.extents, 1e-9)), 1.0]))
     return mesh
 
 
@@ -133,4 +133,4 @@ def _source_mesh(kind: str) -> trimesh.Trimesh:
     path = Path(pybullet_data.getDataPath()) / kind.removeprefix(FILE_KIND)
     if not kind.startswith(FILE_KIND) or ".." in path.parts or not path.is_file():
         raise ValueError(f"unknown kind of thing '{kind}'")
-    return trimesh.load(path, force="mesh", process=False)
+    return trimesh.load_mesh(path, process=False)

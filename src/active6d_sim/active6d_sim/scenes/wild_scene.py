@@ -6,6 +6,7 @@ They train and test estimators for real images: what a simulator lacks becomes a
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -21,6 +22,8 @@ _CONTAINERS = ("tray", "carton", "tote", "none")
 _CONTAINER_SHARES = (0.25, 0.3, 0.2, 0.25)
 _FLOOR_DEPTH = (0.4, 1.0)  # metres below the table
 _DAMAGED_FILE = 168  # of pybullet_data's random_urdfs: its vertices are NaN
+#: Kind, (3,) size and (4, 4) pose of a thing.
+_Plate = tuple[str, np.ndarray, np.ndarray]
 _CARDBOARD = (0.42, 0.27, 0.14)
 
 
@@ -146,11 +149,11 @@ def _on_the_table(model: ObjectModel, bin: Bin, table: tuple[float, float], rng:
     return _things(things.kind, things.size, T, things.color)
 
 
-def _plate(centre: Sequence[float], size: Sequence[float], R: np.ndarray | None = None) -> tuple:
+def _plate(centre: ArrayLike, size: ArrayLike, R: np.ndarray | None = None) -> _Plate:
     return "box", np.array(size, float), make_transform(np.eye(3) if R is None else R, np.array(centre, float))
 
 
-def _plates(plates: Sequence[tuple], color: np.ndarray) -> Surroundings:
+def _plates(plates: Sequence[_Plate], color: np.ndarray) -> Surroundings:
     kinds, sizes, poses = zip(*plates, strict=True) if plates else ((), np.zeros((0, 3)), np.zeros((0, 4, 4)))
     return _things(kinds, np.array(sizes), np.array(poses), color)
 
