@@ -54,7 +54,7 @@ class Measurement:
 
 
 def enlist(
-    model: ObjectModel, estimators: Sequence[str], *, weights: Path | None = None, peers: bool = False
+    model: ObjectModel, estimators: Sequence[str], *, weights: Sequence[Path] = (), peers: bool = False
 ) -> list[Contender]:
     """Create the estimators to compare.
 
