@@ -15,11 +15,13 @@ from mcap_ros2.decoder import DecoderFactory
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
+from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from stub_episode import StubEpisode, is_latched
 
 from active6d_bringup.bags.writer import RecordingError, clear_padding, stamp_of
 from active6d_bringup.nodes.episode_recorder import EpisodeRecorderNode
+from active6d_core.ros.conversions import ns_to_stamp
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.topics import CONTRACT
 
@@ -136,6 +138,22 @@ def test_completeness_names_the_topics_awaited(graph, tmp_path):
         graph.publish(topic, message, latched=is_latched(topic))
     graph.spin_until(lambda: not recorder.missing(last))
     assert graph.call(Trigger, "episode_recorder/complete").success
+
+
+def test_with_use_sim_time_messages_are_recorded_at_the_time_of_the_clock(graph, tmp_path):
+    overrides = {"bag": str(tmp_path / "bag"), "heartbeat": 0.0, "use_sim_time": True}
+    recorder = graph.add(EpisodeRecorderNode(context=graph.context, overrides=overrides))
+    sent, times = StubEpisode(moves=0).messages(), (5 * 10**9, 8 * 10**9)
+    for now, part in zip(times, (sent[:4], sent[4:]), strict=True):
+        graph.publish("/clock", Clock(clock=ns_to_stamp(now)))
+        graph.spin_until(lambda now=now: recorder.get_clock().now().nanoseconds == now, what="the clock")
+        for topic, message in part:
+            graph.publish(topic, message, latched=is_latched(topic))
+        expected = 4 if now == times[0] else len(sent)
+        graph.spin_until(lambda expected=expected: recorder._writer.message_count == expected, what="its messages")
+    graph.remove(recorder)
+    with Reader(tmp_path / "bag") as reader:
+        assert sorted(time for _, time, _ in reader.messages()) == [times[0]] * 4 + [times[1]] * (len(sent) - 4)
 
 
 def test_existing_folder_is_refused(graph, tmp_path):

@@ -110,6 +110,19 @@ def test_what_cannot_work_is_refused_before_anything_starts(refuse, given, cause
         refuse(**given)
 
 
+@pytest.mark.parametrize(
+    ("given", "started"),
+    [
+        ({"camera": "simulator"}, {"camera_simulator", "attention_policy"}),
+        ({"camera": "none", "record": "true"}, {"episode_recorder", "attention_policy"}),
+        ({"camera": "bag"}, {"bag_player"}),
+    ],
+)
+def test_the_nodes_that_a_camera_needs_are_started(names, given, started):
+    defaults = {name: default for name, (default, _, _) in names["ARGUMENTS"].items()}
+    assert names["_wanted"]({**defaults, **given}) == {"pose_estimator", "hypothesis_fusion"} | started
+
+
 @pytest.mark.parametrize(("code", "ends"), [(BAD_PARAMETERS, True), (0, False), (1, False), (-9, False)])
 def test_a_node_that_refuses_its_parameters_ends_the_launch(names, code, ends):
     event = SimpleNamespace(returncode=code, process_name="pose_estimator-1")

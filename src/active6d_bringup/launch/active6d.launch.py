@@ -110,13 +110,20 @@ def _refuse_what_cannot_work(given: dict[str, str]) -> None:
         raise RuntimeError(f"params_file:={given['params_file']} does not exist")
 
 
+def _wanted(given: dict[str, str]) -> set[str]:
+    """Names of the nodes to start. A bag refuses every goal, so there is no policy with it."""
+    wanted = {"pose_estimator", "hypothesis_fusion", *CAMERAS[given["camera"]]}
+    if given["camera"] != "bag":
+        wanted.add("attention_policy")
+    if given["record"] == "true":
+        wanted.add("episode_recorder")
+    return wanted
+
+
 def _graph(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     _refuse_what_cannot_work(given)
-    wanted = {"pose_estimator", "hypothesis_fusion", "attention_policy", *CAMERAS[given["camera"]]}
-    if given["record"] == "true":
-        wanted.add("episode_recorder")
-    nodes = [_node(executable, given) for executable in NODES if executable in wanted]
+    nodes = [_node(executable, given) for executable in NODES if executable in _wanted(given)]
     if given["rviz"] == "true":
         layout = str(SHARE / "rviz" / "active6d.rviz")
         nodes.append(Node(package="rviz2", executable="rviz2", namespace=given["namespace"], arguments=["-d", layout]))

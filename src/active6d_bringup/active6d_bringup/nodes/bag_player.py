@@ -4,6 +4,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from geometry_msgs.msg import PoseStamped
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
@@ -11,7 +12,7 @@ from active6d_bringup.bags.index import BagError, read_bag
 from active6d_core.ros import topics
 from active6d_core.ros.clock_output import ClockOutput
 from active6d_core.ros.conversions import stamp_to_ns
-from active6d_core.ros.episode_messages import EpisodeEnd
+from active6d_core.ros.episode_messages import EpisodeEnd, GoalState, GoalStatus
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
@@ -21,7 +22,7 @@ class BagPlayerNode(GraphNode):
     """Publishes the camera's recorded messages, view by view and byte by byte, then ``episode/end``.
 
     With ``rate`` 0 the next view goes out when ``objects`` of the last one have arrived; otherwise when as much time
-    has passed as in the recording, divided by ``rate``.
+    has passed as in the recording, divided by ``rate``. Goals are refused, because the views are fixed.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -38,7 +39,9 @@ class BagPlayerNode(GraphNode):
         for topic in topics.REPLAYED_TOPICS:
             self._outputs[topic.name] = self.output(topic)
         self._end = self.output(topics.EPISODE_END)
+        self._status = self.output(topics.GOAL_STATUS)
         self.input(topics.OBJECTS, self._on_objects)
+        self.input(topics.VIEW_GOAL, self._on_goal)
         self._timer: Timer | None = None
 
     def setup(self) -> None:
@@ -75,6 +78,10 @@ class BagPlayerNode(GraphNode):
         if self._rate == 0 and stamp_to_ns(message.header.stamp) == self._stamps[: self._next][-1]:
             self._publish_next()
 
+    def _on_goal(self, message: PoseStamped) -> None:
+        stamp, reason = stamp_to_ns(message.header.stamp), "a bag's views come in the order of their recording"
+        self._status.publish(GoalStatus(stamp, self.world_frame, GoalState.REFUSED, reason).to_message())
+
     def _publish_next(self) -> None:
         self.teardown()
         if self._next == len(self._stamps):
@@ -93,7 +100,9 @@ class BagPlayerNode(GraphNode):
         if self._rate > 0:
             following = self._stamps[min(self._next, len(self._stamps) - 1)]
             pause = (self._received[following] - self._received[stamp]) * 1e-9 / self._rate
-            self._timer = self.create_timer(max(pause, 0.0), self._publish_next)
+            # On its own /clock, which stands still between views, the player would wait forever.
+            timer = self.wall_timer if self.value("publish_clock") else self.create_timer
+            self._timer = timer(max(pause, 0.0), self._publish_next)
 
 
 def _read_views(folder: Path) -> tuple[dict[int, dict[str, bytes]], dict[int, int]]:
