@@ -83,3 +83,13 @@ def test_poses_of_the_mesh_file_place_the_file_where_the_object_is(tmp_path, mon
     corners = np.asarray(model.mesh.vertices) @ T_camera_object[0, :3, :3].T + T_camera_object[0, :3, 3]
     for corner in from_file:
         assert np.linalg.norm(corners - corner, axis=1).min() < 1e-9
+
+
+def test_the_kind_of_camera_sets_the_range_and_removes_flying_pixels(estimate, images):
+    rgb, depth, K = images
+    with pytest.raises(ValueError, match="unknown kind of depth camera 'sonar'"):
+        estimate(rgb, depth, K, sensor="sonar")
+    far = np.where(np.isfinite(depth), depth + 6.0, depth)
+    with pytest.raises(ValueError, match="no depth pixel is inside"):
+        estimate(rgb, far, K, sensor="structured_light")
+    assert len(estimate(rgb, depth, K, sensor="time_of_flight")) > 0

@@ -1,10 +1,12 @@
 """Pose estimation as a library call, without ROS: images in, hypotheses out."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from active6d_core.camera import PinholeCamera
+from active6d_core.depth_cameras import depth_camera, without_flying_pixels
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
@@ -48,6 +50,7 @@ class Active6D:
         depth_scale: float | None = None,
         depth_range: tuple[float, float] | None = None,
         region: tuple[np.ndarray, np.ndarray] | None = None,
+        sensor: str | None = None,
         T_world_camera: np.ndarray | None = None,
     ) -> Hypotheses:
         """Estimate poses.
@@ -60,6 +63,8 @@ class Active6D:
             depth_range: nearest and farthest distance to use, metres.
             region: lowest and highest corner of the box to use, metres; in the world where ``T_world_camera`` is given,
                 else in the camera's optical frame.
+            sensor: kind of depth camera, a name of :data:`.DEPTH_CAMERAS`. It sets ``depth_range`` where that is not
+                given, and removes flying pixels of time-of-flight cameras.
             T_world_camera: (4, 4) camera pose.
 
         Returns:
@@ -68,8 +73,13 @@ class Active6D:
         Raises:
             ValueError: the images or the intrinsics cannot be meant; the message says which and why.
         """
+        kind = None if sensor is None else depth_camera(sensor)
         view = make_view(rgb, depth, camera, depth_scale=depth_scale, T_world_camera=T_world_camera)
         self._check_size(np.nanmedian(view.depth), view.camera)
+        if kind is not None:
+            depth_range = depth_range or kind.depth_range
+            if kind.flying_pixels:
+                view = replace(view, depth=without_flying_pixels(view.depth))
         view = crop_depth(view, depth_range, region, region_in_world=T_world_camera is not None)
         return self._estimator.estimate(view).ranked()
 

@@ -82,8 +82,9 @@ def estimate_images(
     depth_range: tuple[float, float] | None = None,
     region: tuple[np.ndarray, np.ndarray] | None = None,
     region_in_world: bool = False,
+    sensor: str | None = None,
 ) -> Iterator[ImageResult]:
-    """Run the estimator on numbered views; yields each result.
+    """Run the estimator on numbered views; yields each result. For the other arguments see :class:`.Active6D`.
 
     Raises:
         ValueError: a view cannot be used; the message has the image's number.
@@ -97,6 +98,7 @@ def estimate_images(
                 view.camera,
                 depth_range=depth_range,
                 region=region,
+                sensor=sensor,
                 T_world_camera=view.T_world_camera if region_in_world else None,
             )
         except ValueError as error:

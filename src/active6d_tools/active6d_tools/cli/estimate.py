@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from active6d_core.camera import View
     from active6d_tools.image_estimation import ImageResult, Overlay
 
+_SENSOR = (
+    "Kind of depth camera: active_stereo, structured_light or time_of_flight. It sets --range where that is not given, "
+    "and removes flying pixels of time-of-flight cameras."
+)
 _BOX = "Use only depth inside a box: X_MIN Y_MIN Z_MIN X_MAX Y_MAX Z_MAX in metres, in the camera's optical frame."
 
 
@@ -33,6 +37,7 @@ def estimate(
         typer.Option(min=0.0, help="Metres per unit of --depth; by default 0.001 for integers, 1 for floats."),
     ] = None,
     estimator: Annotated[str, typer.Option(help="Estimator that finds the poses: auto, {estimators}.")] = "auto",
+    sensor: Annotated[str | None, typer.Option(help=_SENSOR)] = None,
     depth_range: Annotated[
         tuple[float, float] | None,
         typer.Option("--range", metavar="NEAR FAR", help="Use only depth in this range, in metres."),
@@ -68,7 +73,13 @@ def estimate(
     with messages.status(f"loading the estimator of {object_name}"):
         finder = Active6D(object_name, estimator)
     found = estimate_images(
-        finder, scene_id, images, depth_range=depth_range, region=box, region_in_world=region_in_world
+        finder,
+        scene_id,
+        images,
+        depth_range=depth_range,
+        region=box,
+        region_in_world=region_in_world,
+        sensor=sensor,
     )
     results = _draw_each(found, len(images), Overlay(finder.model), out / "overlays", min_score)
     _print(results, min_score)
