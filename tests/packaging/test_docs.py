@@ -1,9 +1,16 @@
-"""What the documents refer to exists: links, files, modules, commands and their options. And they read plainly."""
+"""What the documents refer to exists: links, files, modules, commands and their options.
 
+The documents and the texts in the source (docstrings, comments, messages, help) are in short sentences and standard
+terms.
+"""
+
+import ast
 import re
 import runpy
 import shlex
 import subprocess
+import tokenize
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from unittest import mock
@@ -22,7 +29,11 @@ PAGES = [
 ]
 LONGEST_SENTENCE = 40
 # Words of a private dialect, which standard terms replace.
-DIALECT = re.compile(r"\b(told|mends?|mended|anew|by itself|by themselves|of its own accord|latched)\b", re.IGNORECASE)
+DIALECT = re.compile(
+    r"\b(told|mends?|mended|anew|by itself|by themselves|of its own accord|latched|whoever|somebody|everybody"
+    r"|hears?|heard|speaks?|luck|gauge)\b",
+    re.IGNORECASE,
+)
 #: Files that the commands of a page make, or that a user brings along.
 MADE = re.compile(
     r"^(bags/|scenes?[._]|mug|mine|my_|part\.|path/|\.venv|~|/|steps\.png|curves\.|state\.|best\.|report\.html|build/|rgb/|depth/)"
@@ -171,6 +182,47 @@ def test_sentences_are_short(page):
 @pages
 def test_words_are_standard(page):
     odd = [sentence for sentence in prose(page) if DIALECT.search(sentence)]
+    assert not odd, "\n".join(odd)
+
+
+def source_texts(path: Path) -> Iterator[str]:
+    """Strings and comments of a Python file, values in formatted strings as CODE; neighbouring comments are joined."""
+    tree = ast.parse(path.read_text())
+    parts = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(part.value if isinstance(part, ast.Constant) else "CODE" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in parts:
+            yield node.value
+    with path.open("rb") as file:
+        comments = [token for token in tokenize.tokenize(file.readline) if token.type == tokenize.COMMENT]
+    block: list[str] = []
+    for before, token in zip([None, *comments], comments, strict=False):
+        alone = token.line.lstrip().startswith("#")
+        if not alone or before is None or before.start[0] != token.start[0] - 1:
+            yield " ".join(block)
+            block = []
+        block.append(token.string.lstrip("#: "))
+    yield " ".join(block)
+
+
+def source_sentences() -> Iterator[tuple[Path, str]]:
+    """The sentences in all Python files of the packages; attributes, arguments and items of lists are their own."""
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        for text in source_texts(path):
+            plain = re.sub(r"``[^`]*``|`[^`]*`", "CODE", text)
+            for paragraph in re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.) |\n\s*\w+(?: \([^)]*\))?: ", plain):
+                for sentence in re.split(r"(?<=[.!?])\s+(?=[A-Z0-9\"(*\[])", " ".join(paragraph.split())):
+                    yield path, sentence
+
+
+def test_sentences_in_the_source_are_short():
+    long = [f"{path.name}: {text}" for path, text in source_sentences() if len(text.split()) > LONGEST_SENTENCE]
+    assert not long, "\n".join(long)
+
+
+def test_words_in_the_source_are_standard():
+    odd = [f"{path.name}: {text}" for path, text in source_sentences() if " " in text and DIALECT.search(text)]
     assert not odd, "\n".join(odd)
 
 

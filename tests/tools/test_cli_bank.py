@@ -198,7 +198,7 @@ def test_ablations_give_numbers_and_a_figure(banks, tmp_path, part, monkeypatch)
             *(f"oracle, {noise} noise" for noise in ("own", "unforeseen", "other")),
         ],
         "attention": ["learned", "lowest-score"],
-        "signs": ["turned round", "as printed"],
+        "signs": ["inverted", "as printed"],
     }
     assert [row["variant"] for row in rows] == variants[part]
     for row, expected in zip(rows, expected_rates(banks, tmp_path, part), strict=True):

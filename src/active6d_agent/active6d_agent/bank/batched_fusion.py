@@ -94,7 +94,7 @@ class BatchedFusion:
         return T[order], scene.table[order], scene.view[order], scene.errors[order]
 
     def _nearest_objects(self, scene: BankScene, T_world_object: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """(h,) the true object of least e_ADD for each hypothesis, or the nearest one if none is within 50 mm."""
+        """(h,) the true object of least ADD for each hypothesis, or the nearest one if none is within 50 mm."""
         apart = np.linalg.norm(T_world_object[:, None, :3, 3] - scene.T_world_object[:, :3, 3], axis=-1)
         return np.where(np.isfinite(errors).any(axis=1), errors.argmin(axis=1), apart.argmin(axis=1))
 
@@ -268,7 +268,7 @@ class BatchedFusion:
         return shown[np.unpackbits(left, count=len(shown)).view(bool)]
 
     def object_errors(self, fused: FusedBatch) -> np.ndarray:
-        """(E, o) e_ADD of each true object's best accumulated hypothesis, metres, at most 50 mm."""
+        """(E, o) ADD of each true object's best accumulated hypothesis, metres, at most 50 mm."""
         errors = np.where(fused.objects[..., None] >= 0, self.errors[fused.objects], np.inf)
         return np.minimum(errors.min(axis=1, initial=np.inf), MISSED_E_ADD)
 

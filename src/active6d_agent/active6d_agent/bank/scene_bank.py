@@ -4,7 +4,7 @@ The agent trains and is evaluated on look-ups in a bank, which is thousands of t
 one compressed ``.npz`` per object and split, without pickled data. It holds:
 
 - hypotheses as tables, in the camera's frame and in float32 as in the graph's messages;
-- the true poses, and the e_ADD of every hypothesis against every object within 50 mm;
+- the true poses, and the ADD of every hypothesis against every object within 50 mm;
 - each view's entropy;
 - the surface that each view's depth image shows, one bit for each cell of a grid over the bin.
 """
@@ -44,7 +44,7 @@ class BankScene:
         view: (H,) int, the view that each hypothesis is from, not falling.
         table: (H, 14) float32: position (3) and quaternion (4) in the optical frame, verification score, the
             estimator's score, box (4), depth.
-        errors: (H, n) float32 e_ADD in metres, ``inf`` from 50 mm on.
+        errors: (H, n) float32 ADD in metres, ``inf`` from 50 mm on.
         entropy: (M,) entropy of each view's masks, nats.
         surface: (M, ceil(cells / 8)) uint8, packed bits: the cells of the bank's grid that each view shows surface in.
 

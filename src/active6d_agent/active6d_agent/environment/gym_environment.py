@@ -46,9 +46,9 @@ class Active6DEnv(gym.Env):
     """One episode is T moves in one scene; observations and scores are looked up in a bank.
 
     Observation, a dict of float32: ``objects`` (MAX_OBJECTS, 6) the features B_t of the accumulated objects, padded
-    with zeros; ``mask`` (MAX_OBJECTS,) 1 for an object; ``camera`` (3,) the camera's position over the radius;
-    ``history`` (T, 3) the previous positions over the radius, zeros where there is none yet. The attention module
-    belongs to the policy network, which computes o_t.
+    with zeros, and ``mask`` (MAX_OBJECTS,) 1 for an object. ``camera`` (3,) is the camera's position over the radius,
+    ``history`` (T, 3) the previous ones, zeros where there is none yet. The attention module belongs to the policy
+    network, which computes o_t.
 
     Action: three numbers, azimuth over 180 degrees in [-1, 1], elevation from the horizon (-1) to the zenith (1), and
     the index of the attended object, which the reward needs and the policy's attention decides. The angles are absolute

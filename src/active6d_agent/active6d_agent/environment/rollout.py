@@ -41,7 +41,7 @@ class EpisodeResults:
 
     @property
     def means(self) -> tuple[float, float, float]:
-        """Mean detection rate, mean e_ADD (mm) and mean distance (m)."""
+        """Mean detection rate, mean ADD (mm) and mean distance (m)."""
         return float(self.detection_rate.mean()), float(self.e_add_mm.mean()), float(self.distance_m.mean())
 
 

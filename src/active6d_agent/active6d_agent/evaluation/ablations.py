@@ -146,7 +146,7 @@ def training_variants(
 
     Args:
         part: "alpha", the weight of getting closer in the reward; "attention", learned or by a rule; or "signs", the
-            reward's signs, turned round or as the paper prints them.
+            reward's signs, inverted or as the paper prints them.
         steps: moves T of an episode.
         total: environment steps of each training.
         seed: of the trainings.
@@ -155,7 +155,7 @@ def training_variants(
     if part == "alpha":
         return {str(alpha): (parameters, RewardParameters(alpha=alpha)) for alpha in ALPHAS}
     if part == "signs":
-        signs = {"turned round": False, "as printed": True}
+        signs = {"inverted": False, "as printed": True}
         return {name: (parameters, RewardParameters(as_printed=printed)) for name, printed in signs.items()}
     return {rule: (replace(parameters, attend=rule), RewardParameters()) for rule in ATTENTION_RULES}
 

@@ -10,7 +10,7 @@ _CHUNK = 4096
 
 
 def known(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """(E, o, 2) for every true object after (E, v) views, -1 padding: 1 if it is detected, and 1 - e_ADD / 50 mm.
+    """(E, o, 2) for every true object after (E, v) views, -1 padding: 1 if it is detected, and 1 - ADD / 50 mm.
 
     Zeros beyond a scene's own objects.
     """

@@ -94,7 +94,7 @@ class MaxDistancePolicy:
     """The candidate farthest from all previous views: the largest arc to the nearest of them.
 
     "The longest distance from previous viewpoints" may also mean the last view (to and fro, 9.9 m in 5 moves) or the
-    sum over all (9.1 m); the largest minimum gives 7.0 m, next to the paper's 7.66 m, and spreads views as the paper's
+    sum over all (9.1 m). The largest minimum gives 7.0 m, next to the paper's 7.66 m. It spreads views as the paper's
     figure does.
 
     Args:

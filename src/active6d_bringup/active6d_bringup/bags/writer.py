@@ -102,7 +102,7 @@ def clear_padding(message_type: str, payload: bytes) -> bytes:
     """The same serialized message with zeros for padding, so that the same seed gives the same bytes.
 
     CDR aligns its fields, and the middleware leaves in the gaps whatever its buffer held. A payload that does not
-    decode (text that is not UTF-8) is returned as it is: a recorder keeps what it hears.
+    decode (text that is not UTF-8) is returned as it is: a recorder keeps every message.
     """
     try:
         return bytes(TYPESTORE.serialize_cdr(TYPESTORE.deserialize_cdr(payload, message_type), message_type))

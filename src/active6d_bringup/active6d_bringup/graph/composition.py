@@ -20,7 +20,7 @@ OnEvent = Callable[[str], None]
 
 @dataclass(frozen=True)
 class GraphDescription:
-    """The nodes to run and what they are told.
+    """The nodes to run and their parameters.
 
     Attributes:
         nodes: names in ``NODES``, each with the parameters that override the file's.
@@ -105,7 +105,7 @@ class ComposedGraph:
         self.executor.add_node(node)
 
     def start(self) -> None:
-        """Make all nodes before any of them speaks, then start them one after the other."""
+        """Make all nodes before any of them publishes, then start them one after the other."""
         for name in self._description.in_order():
             node_type = load_node_type(name)
             self.nodes[name] = node_type(

@@ -48,7 +48,7 @@ class EpisodeError(RuntimeError):
 
 
 class EpisodeInterrupted(KeyboardInterrupt):
-    """Somebody pressed Ctrl-C (or sent SIGTERM); the bag is closed and readable."""
+    """Interrupted by Ctrl-C or SIGTERM; the bag is closed and readable."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class EpisodeStep:
         distance: metres of arc since the first view.
         hypotheses: how many the estimator had for this view alone.
         objects: everything accumulated up to this view.
-        ground_truth: (n, 4, 4) ``T_world_object`` if the camera has told, for scoring.
+        ground_truth: (n, 4, 4) ``T_world_object`` if the camera has published it, for scoring.
         goal: ``T_world_camera`` (4, 4) that the policy asked for next; None for the last view.
         latency_ms: node name to the milliseconds it worked on this view.
     """
@@ -265,7 +265,7 @@ def _spin_to_end(
             progress, since = (monitor.received, monitor.end_stamp), time.monotonic()
         idle = time.monotonic() - since
         if not awaited and graph.restarted and idle > _SETTLE_SECONDS:
-            # Whoever is killed while it speaks is not heard by all: the episode went on, the recorder missed a word.
+            # A publisher that dies while publishing does not reach every subscriber: the recorder may lack a message.
             note(f"the bag is not complete: no answer from {topics.describe_missing(unrecorded)}")
             return
         if idle > patience:
@@ -325,7 +325,7 @@ class EpisodeMonitor(Node):
         return [(topics.VIEW_GOAL if view in self._objects else topics.OBJECTS).name]
 
     def result(self, settings: EpisodeSettings, events: list[str]) -> EpisodeResult:
-        """What has been heard of the episode, which must have ended."""
+        """The result of the episode, which must have ended."""
         steps = [self._step(index, stamp) for index, stamp in enumerate(sorted(self._poses.keys() & self._objects))]
         return EpisodeResult(
             settings=settings,

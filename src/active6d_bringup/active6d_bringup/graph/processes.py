@@ -36,7 +36,7 @@ class ProcessGraph:
 
     Args:
         description: of the graph.
-        on_event: told in words what happens to the nodes.
+        on_event: called with what happens to the nodes, in words.
         patience: seconds that a node has to come up, and again to set itself up.
     """
 
@@ -150,7 +150,7 @@ class ProcessGraph:
             self.spin_once(0.05)
 
     def _all_connected(self) -> bool:
-        """Whether every node has found everybody that it speaks to and listens to, this process's own among them."""
+        """Whether every node has found all publishers and subscribers of its topics, this process's own among them."""
         reports = [connections(node) for node in self._guests]
         for name in self._description.in_order():
             client = self._node.create_client(Trigger, f"{name}/connections")

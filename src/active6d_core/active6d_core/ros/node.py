@@ -27,8 +27,6 @@ from active6d_core.ros.heartbeat import Awaited, Watch
 from active6d_core.ros.parameters import ParameterNode
 from active6d_core.ros.topics import Topic
 
-# Both ends: a reliable writer forgets what its queue cannot hold, received by everybody or not.
-_QUEUE_DEPTH = 10
 _LOG_PERIOD_SECONDS = 5.0
 
 
@@ -327,8 +325,8 @@ class GraphNode(ParameterNode):
 def connections(node: Node) -> dict[str, list[tuple[str, int]]]:
     """The topics of a node's ``outputs`` and ``inputs``, each with how many counterparts it has found.
 
-    Whoever starts a graph asks for this before letting anybody speak: the middleware takes seconds to introduce
-    processes to each other, and a message to a stranger is lost.
+    A supervisor asks for this before it activates any node: discovery takes seconds, and a message to an undiscovered
+    subscriber is lost.
     """
     return {
         "outputs": [(output.topic_name, output.get_subscription_count()) for output in node.publishers],

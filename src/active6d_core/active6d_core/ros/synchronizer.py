@@ -55,7 +55,7 @@ class StampSynchronizer:
                 self._drop(earlier)
             self._callback(stamp, values)
         elif len(self._pending) > self._depth:
-            # A stamp that has lost its place may come again: whoever sends it, it is not over.
+            # A stamp that has lost its place may come again from another sender: it is not over.
             oldest = next(iter(self._pending))
             self._on_loss(oldest, sorted(self._names - self._pending.pop(oldest).keys()))
 

@@ -1,7 +1,7 @@
 """Near symmetries of any object: rotations after which most of what a camera sees of it looks as before.
 
 A depth image cannot tell a pose from its near-symmetric twin unless it shows the part of the surface that differs:
-which end of a cup is wider, where the handle of a mug is. So whoever decides on a pose has to know the twins.
+which end of a cup is wider, where the handle of a mug is. So a decision on a pose must consider the twins.
 
 They are found from the mesh. A grid of rotations is compared with the mesh, and the best are registered to it. A cup
 upside down differs from a cup by up to a tenth of its diameter, but the side that a camera sees coincides after a small

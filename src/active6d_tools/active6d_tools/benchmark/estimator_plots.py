@@ -8,7 +8,7 @@ import numpy as np
 from active6d_core.metrics import MISSED_E_ADD
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.single_view_evaluation import EstimatorResult
-from active6d_tools.benchmark.estimator_summary import FEATURE_SEEN, SAME_TURN, axis_rotation_errors, score_study
+from active6d_tools.benchmark.estimator_summary import FEATURE_SEEN, SAME_ROTATION, axis_rotation_errors, score_study
 
 _RIGHT, _WRONG = "tab:green", "tab:red"
 
@@ -65,7 +65,7 @@ def draw_ambiguity(path: Path, title: str, model: ObjectModel, result: Estimator
     names = (f"{part} seen (over {FEATURE_SEEN:.0%} of its surface)", f"{part} hidden")
     label = "certainty of the axis rotation" if found.certain else "score"
     for (axes, histogram), name, chosen in zip(panels.T, names, (found.seen, ~found.seen), strict=True):
-        right = chosen & (found.rotation < SAME_TURN)
+        right = chosen & (found.rotation < SAME_ROTATION)
         for group, color in ((right, _RIGHT), (chosen & ~right, _WRONG)):
             axes.plot(
                 found.rotation[group],
@@ -83,7 +83,7 @@ def draw_ambiguity(path: Path, title: str, model: ObjectModel, result: Estimator
         histogram.set(xlabel="true rotation error, degrees", ylabel="hypotheses")
         for part_of_panel in (axes, histogram):
             part_of_panel.grid(alpha=0.3)
-            part_of_panel.axvline(SAME_TURN, color="0.4", linestyle="--", linewidth=1)
+            part_of_panel.axvline(SAME_ROTATION, color="0.4", linestyle="--", linewidth=1)
     _save(figure, path, title)
 
 

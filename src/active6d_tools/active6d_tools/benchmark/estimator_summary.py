@@ -35,7 +35,7 @@ PRECISIONS = (0.95, 0.98)
 #: Hypotheses with at least this score count as reported.
 SURE = 0.5
 #: A rotation about the axis is right within this many degrees.
-SAME_TURN = 30.0
+SAME_ROTATION = 30.0
 
 
 def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> dict[str, Any]:
@@ -196,7 +196,7 @@ def axis_rotation_errors(result: EstimatorResult) -> AxisRotationErrors:
 def ambiguity_study(result: EstimatorResult) -> dict[str, Any]:
     """Whether the certainty is low where the rotation about the axis is wrong."""
     found = axis_rotation_errors(result)
-    right = found.rotation < SAME_TURN
+    right = found.rotation < SAME_ROTATION
     study: dict[str, Any] = {
         "told_by": "certainty" if found.certain else "score",
         "auc": area_under_curve(found.certainty, right) if len(right) else None,

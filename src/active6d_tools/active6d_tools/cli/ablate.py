@@ -71,11 +71,13 @@ def ablate(
 ) -> None:
     """Vary one part of the method or leave it out, and evaluate the policies, as in the paper's figures.
 
-    alpha: weight of getting closer in the reward. steps: number of moves. attention: learned attention against the
-    lowest score. verification: ranking by verification score against the estimator's score. fusion: with clustering
-    and without. signs: signs of the reward, reversed and as the paper prints them. planning: parameters of the
-    default policy, without training. noise-resampling: the same views with other sensor noise, from a second bank
-    (active6d bank --split test --seed 1). seeds: three trainings of both learned policies; missing ones are trained.
+    [bold]alpha[/bold]: weight of getting closer in the reward. [bold]steps[/bold]: number of moves.
+    [bold]attention[/bold]: learned attention against the lowest score. [bold]verification[/bold]: ranking by
+    verification score against the estimator's score. [bold]fusion[/bold]: with clustering and without.
+    [bold]signs[/bold]: signs of the reward, inverted and as the paper prints them. [bold]planning[/bold]: parameters
+    of the default policy, without training. [bold]noise-resampling[/bold]: the same views with other sensor noise,
+    from a second bank (active6d bank --split test --seed 1). [bold]seeds[/bold]: three trainings of both learned
+    policies; missing ones are trained.
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """

@@ -89,7 +89,7 @@ def _attention_learned(own: Measured) -> Verdict:
     lowest = own["attention"]["rows"][1]
     against = lowest["against_first"]
     found, error = against["detection_rate"], against["e_add_mm"]
-    figures = f"{number(-found['mean'], 3, True)} found, e_ADD {percent(-error['mean'] / lowest['e_add_mm'], True)}"
+    figures = f"{number(-found['mean'], 3, True)} found, ADD {percent(-error['mean'] / lowest['e_add_mm'], True)}"
     met = found["mean"] < 0 < error["mean"] and found["excludes_zero"] and error["excludes_zero"]
     surely = found["excludes_zero_scenes"] and error["excludes_zero_scenes"]
     return Verdict(met, figures, "over starts, not over scenes" if met and not surely else "")
@@ -124,23 +124,23 @@ GOALS: dict[str, Callable[[Measured], Verdict]] = {
     "The default policy finds more than every baseline": lambda own: beats(
         own["evaluate"], DEFAULT, BASELINES, ["detection_rate"]
     ),
-    "It has a lower e_ADD than every baseline": lambda own: beats(own["evaluate"], DEFAULT, BASELINES, ["e_add_mm"]),
-    "At no more metres than Random": _no_farther,
+    "It has a lower ADD than every baseline": lambda own: beats(own["evaluate"], DEFAULT, BASELINES, ["e_add_mm"]),
+    "It travels no farther than Random": _no_farther,
     "It closes 60 % of the gap from Random to the greedy oracle (aim: 80 %)": _gap,
     "It reaches with 5 moves what Random reaches with 10": _five_like_ten,
     "The paper's policy beats Random and Maximum distance on both measures": lambda own: beats(
         own["evaluate"], PAPERS, ("random", "max-distance"), ["detection_rate", "e_add_mm"]
     ),
-    "Its learned attention beats the lowest score (the paper: +3 % found, -9 % e_ADD)": _attention_learned,
+    "Its learned attention beats the lowest score (the paper: +3 % found, -9 % ADD)": _attention_learned,
     "Training takes less than 30 minutes": _trained_in_time,
     "Three seeds were trained, and the one that is best on validation scenes ships": _seeds,
-    "The environment makes 10,000 steps a second (aim: 50,000)": _faster(
-        "environment", "steps_per_second", 10_000, 50_000, "a second"
+    "The environment makes 10,000 steps per second (aim: 50,000)": _faster(
+        "environment", "steps_per_second", 10_000, 50_000, "per second"
     ),
     "Verification, fusion and policy run at 250 Hz (the paper: 25 Hz)": _faster(
         "pipeline", "hz_total", 250, float("inf"), "Hz"
     ),
-    "A decision takes less than 5 ms, 99 times of 100": _decides_in_time,
+    "A decision takes less than 5 ms (99th percentile)": _decides_in_time,
 }
 
 
@@ -164,13 +164,13 @@ def _no_closeness(own: Measured) -> Verdict:
 
 
 CLAIMS: dict[str, Callable[[Measured], Verdict]] = {
-    "The proposed policy has a lower e_ADD and finds more than Random, Maximum distance and Unidirectional (Table 1)": (
+    "The proposed policy has a lower ADD and finds more than Random, Maximum distance and Unidirectional (Table 1)": (
         lambda own: beats(
             own["evaluate"], PAPERS, ("random", "max-distance", "unidirectional"), ["detection_rate", "e_add_mm"]
         )
     ),
     "More views help, but hardly after T = 10 (here: at least 90 % of the gain of all views)": _saturates,
-    "Too much weight on closeness lengthens the way": _too_much_closeness,
-    "Without closeness the policy is harder to learn (here: some alpha has a lower e_ADD than 0)": _no_closeness,
-    "The learned attention beats the lowest score, +3 % found and -9 % e_ADD": _attention_learned,
+    "Too much weight on closeness increases the distance": _too_much_closeness,
+    "Without closeness the policy is harder to learn (here: some alpha has a lower ADD than 0)": _no_closeness,
+    "The learned attention beats the lowest score, +3 % found and -9 % ADD": _attention_learned,
 }

@@ -16,10 +16,10 @@ MEASURES = {
     "e_add_mm": (" mm", 2, -1),
     "distance_m": (" m", 2, -1),
     "moves": (" moves", 1, 0),
-    "reported": (" an object", 2, 0),
+    "reported": (" per object", 2, 0),
 }
 PAPER_STEPS = 5
-#: Table 1 of the paper, after five moves: metres, e_ADD in mm, detection rate.
+#: Table 1 of the paper, after five moves: metres, ADD in mm, detection rate.
 PAPER = {
     "coffee_cup": {
         "random": (4.97, 13.48, 0.76),
@@ -72,7 +72,7 @@ def mark(difference: dict[str, Any], better: int) -> str:
 def policies_table(report: dict[str, Any]) -> str:
     """The paper's Table 1, with intervals over scenes, bounds, and the paper's numbers where it has any."""
     paper = PAPER.get(report["object"], {}) if report["steps"] == PAPER_STEPS else {}
-    header = ["policy", "d, m", "e_ADD, mm", "detection rate", "gap closed"]
+    header = ["policy", "distance, m", "ADD, mm", "detection rate", "gap closed"]
     rows = []
     for name, row in report["policies"].items():
         cells = [f"`{name}`", number(row["distance_m"], 2)]
@@ -99,7 +99,7 @@ def differences_table(report: dict[str, Any], name: str) -> str:
             text = f"{number(own['mean'], digits, True)} {interval(own['ci95_scenes'], digits, True)}"
             cells.append(f"{mark(own, better)} {text}")
         rows.append(cells)
-    return table([f"`{name}` less", "detection rate", "e_ADD, mm", "d, m"], rows)
+    return table([f"`{name}` minus", "detection rate", "ADD, mm", "distance, m"], rows)
 
 
 def variants_table(reports: Reports, keys: Sequence[str]) -> str:
@@ -162,7 +162,7 @@ def _pivot(reports: Reports, key: Callable[[dict], str], render: Callable[[dict]
 
 def environment_table(reports: Reports) -> str:
     """Steps of the training environment per second."""
-    header = ["", "steps a second", "processes"]
+    header = ["", "steps per second", "processes"]
     return table(
         header, ([name, f"{own['steps_per_second']:,.0f}", str(own["workers"])] for name, own in reports.items())
     )
@@ -170,7 +170,7 @@ def environment_table(reports: Reports) -> str:
 
 def pipeline_table(reports: Reports) -> str:
     """Times of the last of six views after the estimator."""
-    header = ["", "objects", "verification", "fusion", "policy", "all", "a decision, 99th percentile"]
+    header = ["", "objects", "verification", "fusion", "policy", "all", "decision, 99th percentile"]
     rows = []
     for name, own in reports.items():
         parts = (f"{own[f'{part}_ms']:.2f} ms" for part in ("verification", "fusion", "policy"))

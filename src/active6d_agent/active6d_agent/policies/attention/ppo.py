@@ -236,7 +236,7 @@ def train_ppo(
     """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
 
     ``folder`` receives ``curve.jsonl``, ``best.safetensors`` with its JSON (highest validation detection rate, lower
-    e_ADD of equals), and ``latest.safetensors`` with ``latest.json`` to continue from.
+    ADD of equals), and ``latest.safetensors`` with ``latest.json`` to continue from.
 
     Args:
         train: scenes to train on.
@@ -293,7 +293,7 @@ def _make_ppo(lookup: BatchedFusion, parameters: PpoParameters, reward: RewardPa
 
 
 def validate(network: AttentionNetwork, lookup: BatchedFusion, steps: int) -> tuple[float, float, float]:
-    """Detection rate, e_ADD (mm) and metres of the network's mean actions over all scenes and starting views."""
+    """Detection rate, ADD (mm) and metres of the network's mean actions over all scenes and starting views."""
     starts = all_starts(lookup)
 
     def choose(_: np.ndarray, observations: list[Observation]) -> np.ndarray:

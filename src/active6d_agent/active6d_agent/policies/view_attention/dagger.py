@@ -152,7 +152,7 @@ def train_dagger(
 ) -> Iterator[DaggerProgress]:
     """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
 
-    ``folder`` receives ``curve.jsonl``, ``best.safetensors`` (highest validation detection rate, lower e_ADD of equals)
+    ``folder`` receives ``curve.jsonl``, ``best.safetensors`` (highest validation detection rate, lower ADD of equals)
     and ``latest.safetensors``, each with its JSON. At the end the best gets its weighing by :func:`choose_weighing`.
 
     Args:
@@ -230,7 +230,7 @@ def choose_weighing(network: ViewAttention, validation: BatchedFusion, starts: n
 def validate(
     network: ViewAttention, lookup: BatchedFusion, starts: np.ndarray, steps: int
 ) -> tuple[float, float, float]:
-    """Detection rate, e_ADD (mm) and metres of the network's moves from (E, 2) starts."""
+    """Detection rate, ADD (mm) and metres of the network's moves from (E, 2) starts."""
     moves = np.full(len(starts), steps)
     views = roll_out(lookup, greedy(network, lookup.model), starts[:, 0], starts[:, 1], moves)
     return measure(lookup, starts[:, 0], views).means
@@ -300,7 +300,7 @@ def stand_for(
     """Items that stand for true objects, and those objects.
 
     An accumulated object, given by its hypothesis in ``rows``, stands for the true object that it is nearest to in
-    e_ADD. A cluster of unexplained surface stands for the nearest true object without an accumulated one.
+    ADD. A cluster of unexplained surface stands for the nearest true object without an accumulated one.
     """
     order = np.argsort(-lookup.verification[rows], kind="stable")
     stands_for, best = np.unique(lookup.nearest_object[rows], return_index=True)

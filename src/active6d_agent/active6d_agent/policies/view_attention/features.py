@@ -223,11 +223,13 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
 
     Returns:
         ``items`` (B, n, 18) and ``outlooks`` (B, M, 8) of the states. ``present`` (B, n), which items are no padding.
-        ``more`` (B,), whether moves are left after the next. ``pairs`` (B, M, n, 12), features of each item and view:
-        the share of the item that the view would show; how much more that is than the views taken have shown; how
-        steeply the view looks down on the item; the angle to the nearest view taken, seen from the item, and its
-        cosine; how much the views taken have seen from that side; the distance; whether the view is on the item's side
-        of the bin; how far the item is from the image's centre; and the direction to the view in the object's frame.
+        ``more`` (B,), whether moves are left after the next. ``pairs`` (B, M, n, 12), features of each item and view.
+
+        These 12 are the share of the item that the view would show, and how much more that is than the views taken have
+        shown. Then how steeply the view looks down, the angle to the nearest view taken, seen from the item, and its
+        cosine. Then how much the views taken have seen from that side, the distance, and whether the view is on the
+        item's side of the bin. Then how far the item is from the image's centre, and the direction to the view in the
+        object's frame (3).
     """
     count = max(1, *(len(each.pose) for each in states))
     some = slice(None) if views is None else views

@@ -37,7 +37,7 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.expected_visibility import Tray
 
-#: A gain is the number of objects newly detected, and the fall of the summed e_ADD over 50 mm.
+#: A gain is the number of objects newly detected, and the fall of the summed ADD over 50 mm.
 GAINS = 2
 
 
@@ -47,7 +47,7 @@ class Weighing:
 
     Attributes:
         metres_weight: objects that one metre of travel costs.
-        error_weight: of the fall of the summed e_ADD over 50 mm, in objects detected.
+        error_weight: of the fall of the summed ADD over 50 mm, in objects detected.
         lookahead: in [0, 1], weight of the gain of the moves after the next.
 
     Raises:

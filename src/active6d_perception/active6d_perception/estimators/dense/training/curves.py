@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 _RATES = {
-    "add_half": "e_ADD, half visible",
-    "add_tenth": "e_ADD, a tenth visible",
+    "add_half": "ADD, half visible",
+    "add_tenth": "ADD, a tenth visible",
     "adds_half": "ADD-S, half visible",
     "adds_tenth": "ADD-S, a tenth visible",
     "precision": "precision",
