@@ -23,10 +23,12 @@ setup(
         "active6d_agent",
         "active6d_core",
         "active6d_perception",
+        "mcap",
         "numpy",
         "opencv-contrib-python-headless",
         "pyyaml",
         "rosbags",
+        "zstandard",
     ],
     entry_points={
         "console_scripts": [

@@ -1,14 +1,17 @@
 """The recorder's bag holds what was sent, byte by byte, and two other libraries read it."""
 
+import errno
 import io
 import os
 import signal
 import subprocess
 import sys
+import time
 from collections import defaultdict
 
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -19,7 +22,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from stub_episode import StubEpisode, is_latched
 
-from active6d_bringup.bags.writer import RecordingError, clear_padding, stamp_of
+from active6d_bringup.bags.index import read_bag
+from active6d_bringup.bags.writer import EpisodeWriter, RecordingError, clear_padding, stamp_of
 from active6d_bringup.nodes.episode_recorder import EpisodeRecorderNode
 from active6d_core.ros.conversions import ns_to_stamp
 from active6d_core.ros.node import GraphNode
@@ -140,7 +144,8 @@ def test_completeness_names_the_topics_awaited(graph, tmp_path):
     assert graph.call(Trigger, "episode_recorder/complete").success
 
 
-def test_with_use_sim_time_messages_are_recorded_at_the_time_of_the_clock(graph, tmp_path):
+def test_with_use_sim_time_log_times_are_the_systems_and_publish_times_the_clocks(graph, tmp_path):
+    began = time.time_ns()
     overrides = {"bag": str(tmp_path / "bag"), "heartbeat": 0.0, "use_sim_time": True}
     recorder = graph.add(EpisodeRecorderNode(context=graph.context, overrides=overrides))
     sent, times = StubEpisode(moves=0).messages(), (5 * 10**9, 8 * 10**9)
@@ -152,8 +157,62 @@ def test_with_use_sim_time_messages_are_recorded_at_the_time_of_the_clock(graph,
         expected = 4 if now == times[0] else len(sent)
         graph.spin_until(lambda expected=expected: recorder._writer.message_count == expected, what="its messages")
     graph.remove(recorder)
-    with Reader(tmp_path / "bag") as reader:
-        assert sorted(time for _, time, _ in reader.messages()) == [times[0]] * 4 + [times[1]] * (len(sent) - 4)
+    data = io.BytesIO((tmp_path / "bag/bag.mcap").read_bytes())
+    recorded = [message for _, _, message in make_reader(data).iter_messages()]
+    assert all(began <= message.log_time <= time.time_ns() for message in recorded)
+    assert sorted(message.publish_time for message in recorded) == [times[0]] * 4 + [times[1]] * (len(sent) - 4)
+
+
+def test_a_killed_recording_is_read_and_goes_on_in_the_next_file(graph, tmp_path):
+    folder, sent = tmp_path / "bag", StubEpisode().messages()
+    names = {topic.name: topic.name if topic.name.startswith("/") else f"/{topic.name}" for topic in CONTRACT}
+    killed = EpisodeWriter(folder, names, '{"pose_estimator": {"object": "mug"}}')
+    for index, (topic, message) in enumerate(sent[:20]):
+        killed.write(topic, serialize_message(message), 10**18 + index)
+    with (folder / "bag.mcap").open("ab") as file:
+        file.write(b"\x06half a record")  # what a SIGKILL in the middle of a write leaves
+    index = read_bag(folder)
+    assert index.damage[0] == "there is no metadata.yaml, the recording was killed"
+    assert "cannot be read from byte" in index.damage[1]
+    assert index.settings == {"pose_estimator": {"object": "mug"}}
+    assert sum(map(len, index.payloads.values())) + len(index.diagnostics) == 20
+    writer = EpisodeWriter(folder, names, resume=True)
+    for number, (topic, message) in enumerate(sent[18:]):  # latched messages come again
+        writer.write(topic, serialize_message(message), 10**18 + 100 + number)
+    assert not writer.missing(writer.last_end)
+    writer.close()
+    assert sorted(path.name for path in folder.iterdir()) == ["bag.mcap", "bag_1.mcap", "metadata.yaml"]
+    index = read_bag(folder)
+    assert index.damage == ()
+    assert sum(map(len, index.payloads.values())) + len(index.diagnostics) == len(sent)
+    with Reader(folder) as reader:  # another library finds both files whole
+        assert sum(1 for _ in reader.messages()) == len(sent) + 2
+
+
+def test_a_full_disk_names_the_folder_and_lets_the_episode_end(graph, tmp_path, monkeypatch):
+    recorder = graph.add(
+        EpisodeRecorderNode(context=graph.context, overrides={"bag": str(tmp_path / "bag"), "heartbeat": 0.0})
+    )
+    diagnostics = graph.mailbox(DiagnosticArray, "/diagnostics")
+    sent = StubEpisode().messages()
+    for topic, message in sent[:10]:
+        recorder._write(topic, serialize_message(message))
+
+    def full():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(recorder._writer._writer, "flush", full)
+    for topic, message in sent[10:]:
+        recorder._write(topic, serialize_message(message))
+    graph.spin_until(lambda: any("recording stopped" in d.status[0].message for d in diagnostics))
+    reason = f"{tmp_path / 'bag'} cannot be written: No space left on device; it holds 1 views, 10 messages"
+    assert any(reason in d.status[0].message for d in diagnostics)
+    assert recorder.missing(10**9) == []
+    answer = graph.call(Trigger, "episode_recorder/complete")
+    assert answer.success
+    assert reason in answer.message
+    graph.remove(recorder)
+    assert sum(map(len, read_bag(tmp_path / "bag").payloads.values())) >= 10
 
 
 def test_existing_folder_is_refused(graph, tmp_path):

@@ -42,6 +42,7 @@ LIBRARIES = {
     "trimesh": ("python3-trimesh-pip", "trimesh"),
     "typer": (None, "typer"),
     "yaml": ("python3-yaml", "pyyaml"),
+    "zstandard": (None, "zstandard"),
 }
 # What a package needs and no import shows: `ros2 launch` itself, and the packages whose nodes bringup loads by name.
 NOT_IMPORTED = {"active6d_bringup": {"active6d_agent", "active6d_perception", "ros2launch"}}

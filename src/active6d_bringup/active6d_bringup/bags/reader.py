@@ -81,6 +81,7 @@ class EpisodeRecord:
         ground_truth: (n, 4, 4) ``T_world_object`` of the scene, None where the bag has none (a real camera).
         end_reason: why the policy stopped, None if the recording was cut off before.
         world_frame: name of the world's frame.
+        damage: what is missing or damaged in the bag, in words.
     """
 
     folder: Path
@@ -89,6 +90,7 @@ class EpisodeRecord:
     ground_truth: np.ndarray | None
     end_reason: str | None
     world_frame: str
+    damage: tuple[str, ...] = ()
 
     @property
     def object(self) -> str | None:
@@ -126,7 +128,7 @@ def read_episodes(bag: Path | str | BagIndex) -> list[EpisodeRecord]:
     index = bag if isinstance(bag, BagIndex) else read_bag(Path(bag))
     try:
         messages, latencies = _read_messages(index)
-        return _episodes(index.folder, messages, latencies)
+        return _episodes(index, messages, latencies)
     except MessageError as error:
         raise BagError(f"{index.folder}: {error}") from error
 
@@ -154,16 +156,19 @@ def _read_messages(index: BagIndex) -> tuple[dict[str, dict[int, Any]], dict[int
     return messages, latencies
 
 
-def _episodes(folder: Path, messages: dict[str, dict[int, Any]], latencies: dict) -> list[EpisodeRecord]:
+def _episodes(index: BagIndex, messages: dict[str, dict[int, Any]], latencies: dict) -> list[EpisodeRecord]:
     views = sorted(set.intersection(*(set(messages[topic.name]) for topic in CAMERA_TOPICS)))
     if not views:
-        raise BagError(f"{folder}: holds no complete view (color, depth, camera_info and pose of one stamp)")
+        what = "holds no complete view (color, depth, camera_info and pose of one stamp)"
+        raise BagError("; ".join([f"{index.folder}: {what}", *index.damage]))
     starts = [views[0], *(start for start in sorted(messages[EPISODE_START.name]) if views[0] < start <= views[-1])]
     limits = [*starts[1:], views[-1] + 1]
-    return [_episode(folder, messages, latencies, *span, views) for span in zip(starts, limits, strict=True)]
+    return [_episode(index, messages, latencies, *span, views) for span in zip(starts, limits, strict=True)]
 
 
-def _episode(folder: Path, messages: dict, latencies: dict, start: int, limit: int, views: list[int]) -> EpisodeRecord:
+def _episode(
+    index: BagIndex, messages: dict, latencies: dict, start: int, limit: int, views: list[int]
+) -> EpisodeRecord:
     """The episode whose views have stamps in [start, limit)."""
 
     def within(topic: str) -> list[Any]:
@@ -174,12 +179,13 @@ def _episode(folder: Path, messages: dict, latencies: dict, start: int, limit: i
     # The camera's word comes last: both sides say their seed, and the camera's is the one of the heap.
     statuses = [status for message in (*ends, *within(EPISODE_START.name)) for status in message.status]
     return EpisodeRecord(
-        folder=folder,
+        folder=index.folder,
         info={pair.key: pair.value for status in statuses for pair in status.values},
         steps=[_step(messages, latencies.get(view, {}), view, world) for view in views if start <= view < limit],
         ground_truth=poses_from_array(truth[-1], world) if truth else None,
         end_reason=ends[-1].status[0].message if ends and ends[-1].status else None,
         world_frame=world,
+        damage=index.damage,
     )
 
 

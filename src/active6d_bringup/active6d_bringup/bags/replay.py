@@ -120,6 +120,8 @@ def replay(
         EpisodeInterrupted: by Ctrl-C or SIGTERM.
     """
     index = read_bag(settings.bag)
+    for line in index.damage:
+        on_event(f"{settings.bag}: {line}")
     episodes = read_episodes(index)
     stamps = [step.stamp for episode in episodes for step in episode.steps]
     description = describe(settings, episodes[0].object, index.settings)

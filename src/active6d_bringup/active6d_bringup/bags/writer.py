@@ -1,23 +1,29 @@
-"""Writing an episode as a rosbag2 folder: MCAP storage, schemas in the file, zstd chunks. No rclpy in here."""
+"""Writing an episode as a rosbag2 folder: MCAP storage, schemas in the file, zstd chunks with checksums. No rclpy."""
 
+from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, BinaryIO, Literal
+from zlib import crc32
 
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+import yaml
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
-from active6d_core.ros.topics import CONTRACT, EPISODE_END, EPISODE_START, Per, Topic
+from active6d_bringup.bags.mcap_file import McapFile
+from active6d_core.files import write_file
+from active6d_core.ros.topics import CAMERA_POSE, CONTRACT, EPISODE_END, EPISODE_START, Per, Topic
 
 #: Definitions and hashes of every standard message type.
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 
-_FOREVER = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
-
-
-#: Key of the nodes' settings among the custom data of metadata.yaml.
+#: Key of all that metadata.yaml says.
+INFORMATION = "rosbag2_bagfile_information"
+#: Key of the nodes' settings among the custom data of metadata.yaml, and in the metadata of every file.
 SETTINGS = "active6d_settings"
+#: Name of this project's metadata record in an MCAP file, and the key of the checksum of metadata.yaml in it.
+ACTIVE6D, CHECKSUM = "active6d", "metadata_crc32"
 
 
 class RecordingError(ValueError):
@@ -25,48 +31,109 @@ class RecordingError(ValueError):
 
 
 class EpisodeWriter:
-    """A new bag folder, open for messages that are serialized already.
+    """A bag folder, open for messages that are serialized already.
+
+    Every message is a chunk of its own with a checksum, and handed to the operating system at once: when the process
+    is killed, everything that it has written is there.
 
     Args:
-        folder: must not exist; its parents may.
+        folder: must not exist unless ``resume``; its parents may.
         names: topic of the contract to the name it has in the bag (resolved against namespace and remaps).
-        settings: the nodes' parameters as JSON; kept in metadata.yaml so that a replay can set the same.
+        settings: the nodes' parameters as JSON, so that a replay can set the same.
+        resume: go on with the next file of a bag whose recorder was killed.
 
     Raises:
         RecordingError: the folder exists, or cannot be made.
     """
 
-    def __init__(self, folder: Path, names: dict[str, str], settings: str = "{}") -> None:
+    def __init__(self, folder: Path, names: dict[str, str], settings: str = "{}", *, resume: bool = False) -> None:
         self.folder = folder
-        if folder.exists():
-            raise RecordingError(f"{folder} exists already; name a new folder for the bag or remove this one")
-        self._writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
-        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        self._writer.set_custom_data(SETTINGS, settings)
-        try:
-            self._writer.open()
-        except OSError as error:
-            raise RecordingError(f"{folder} cannot be created: {error.strerror}") from error
+        self._names, self._settings = names, settings
         self._topics = {topic.name: topic for topic in CONTRACT}
-        self._connections = {
-            topic.name: self._writer.add_connection(
-                names[topic.name], topic.type, typestore=TYPESTORE, offered_qos_profiles=[_offered(topic)]
-            )
-            for topic in CONTRACT
-        }
         self._stamps: dict[str, set[int]] = {topic.name: set() for topic in CONTRACT}
-        self._closed = False
+        self._files: list[dict[str, Any]] = []
+        self._writer: McapWriter
+        self._stream: BinaryIO
+        if folder.exists() and not resume:
+            raise RecordingError(f"{folder} exists already; name a new folder for the bag or remove this one")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in sorted(folder.glob("*.mcap"), key=file_number):
+                self._files.append(self._keep(path))
+            number = f"_{len(self._files)}" if self._files else ""
+            self._open(folder / f"{folder.name}{number}.mcap")
+        except OSError as error:
+            raise RecordingError(f"{folder} cannot be written: {error.strerror}") from error
 
-    def write(self, topic: str, payload: bytes, received: int) -> None:
-        """Append one message of the contract's ``topic``: its CDR bytes, and when it came in nanoseconds."""
+    def write(self, topic: str, payload: bytes, received: int, published: int | None = None) -> None:
+        """Append one message of the contract's ``topic``.
+
+        Args:
+            topic: name in the contract.
+            payload: CDR bytes.
+            received: the system's time at which it came, nanoseconds.
+            published: the time of its graph, which a simulation may set, nanoseconds; None for the same.
+
+        Raises:
+            RecordingError: the disk is full, or the folder is gone; what was written before stays readable.
+        """
         message_type = self._topics[topic].type
-        self._writer.write(self._connections[topic], received, clear_padding(message_type, payload))
+        try:
+            content = clear_padding(message_type, payload)
+            self._writer.add_message(
+                self._channels[topic], received, content, received if published is None else published
+            )
+            self._writer.flush()
+        except OSError as error:
+            self._broken = True
+            raise RecordingError(f"{self.folder} cannot be written: {error.strerror}; {self.summary()}") from error
+        file = self._files[-1]
+        file["counts"][topic] += 1
+        file["first"], file["last"] = min(file["first"], received), max(file["last"], received)
         self._stamps[topic].add(stamp_of(message_type, payload))
 
     @property
     def message_count(self) -> int:
         """Messages written so far."""
-        return sum(self._writer.counts.values())
+        return sum(sum(file["counts"].values()) for file in self._files)
+
+    def summary(self) -> str:
+        """How many views and messages the bag holds, in words."""
+        views = len(self._stamps[CAMERA_POSE.name])
+        return f"it holds {views} views, {self.message_count} messages"
+
+    def _open(self, path: Path) -> None:
+        """Begin a file of the bag."""
+        self._stream, self._broken = path.open("xb"), False
+        self._writer = McapWriter(self._stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        self._writer.start(profile="ros2", library="active6d")
+        self._writer.add_metadata(ACTIVE6D, {SETTINGS: self._settings})
+        schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        for topic in CONTRACT:
+            if topic.type not in schemas:
+                definition, _ = TYPESTORE.generate_msgdef(topic.type, ros_version=2)
+                schemas[topic.type] = self._writer.register_schema(topic.type, "ros2msg", definition.encode())
+            qos = yaml.safe_dump([_offered(topic)], sort_keys=False)
+            self._channels[topic.name] = self._writer.register_channel(
+                self._names[topic.name], "cdr", schemas[topic.type], {"offered_qos_profiles": qos}
+            )
+        self._writer.flush()
+        self._files.append(_new_file(path))
+
+    def _keep(self, path: Path) -> dict[str, Any]:
+        """Take a file that an earlier recorder left, and give it the end that it lacks."""
+        whole = McapFile(path)
+        topics = {name: topic for topic, name in self._names.items()}
+        messages = [message for message in whole.messages() if message.topic in topics]
+        repaired = path.with_suffix(".part")
+        repaired.unlink(missing_ok=True)
+        self._open(repaired)
+        for message in messages:
+            self.write(topics[message.topic], message.payload, message.received)
+        self._finish()
+        repaired.replace(path)
+        return {**self._files.pop(), "path": path.name}
 
     @property
     def last_end(self) -> int | None:
@@ -92,10 +159,86 @@ class EpisodeWriter:
         return late + [topic for topic, at in ends if at not in self._stamps[topic]]
 
     def close(self) -> None:
-        """Write the index and metadata.yaml; a second call does nothing."""
-        if not self._closed:
-            self._closed = True
-            self._writer.close()
+        """Write the index and metadata.yaml; a second call does nothing.
+
+        Raises:
+            RecordingError: the disk is full; the messages that were written can be read all the same.
+        """
+        if self._stream.closed:
+            return
+        text = yaml.safe_dump({INFORMATION: self._describe()}, sort_keys=False)
+        try:
+            if self._broken:
+                self._stream.close()
+            else:
+                checksum = f"{crc32(text.encode()):08x}"
+                self._writer.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(self._describe())})
+                self._writer.add_metadata(ACTIVE6D, {SETTINGS: self._settings, CHECKSUM: checksum})
+                self._finish()
+            write_file(self.folder / "metadata.yaml", text)
+        except OSError as error:
+            with suppress(OSError):
+                self._stream.close()
+            raise RecordingError(f"{self.folder} cannot be written: {error.strerror}; {self.summary()}") from error
+
+    def _finish(self) -> None:
+        self._writer.finish()
+        self._stream.close()
+
+    def _describe(self) -> dict[str, Any]:
+        """What metadata.yaml says, in version 9 of rosbag2's format (Jazzy)."""
+        files = [file for file in self._files if sum(file["counts"].values())] or self._files
+        start, end = min(file["first"] for file in files), max(file["last"] for file in files)
+
+        def span(first: int, last: int) -> dict[str, Any]:
+            return {
+                "duration": {"nanoseconds": max(last - first, 0)},
+                "starting_time": {"nanoseconds_since_epoch": first},
+            }
+
+        counts = {topic.name: sum(file["counts"][topic.name] for file in self._files) for topic in CONTRACT}
+        return {
+            "version": 9,
+            "storage_identifier": "mcap",
+            "relative_file_paths": [file["path"] for file in self._files],
+            **span(start, end),
+            "message_count": self.message_count,
+            "topics_with_message_count": [
+                {
+                    "topic_metadata": {
+                        "name": self._names[topic.name],
+                        "type": topic.type,
+                        "serialization_format": "cdr",
+                        "offered_qos_profiles": [_offered(topic)],
+                        "type_description_hash": TYPESTORE.hash_rihs01(topic.type),
+                    },
+                    "message_count": counts[topic.name],
+                }
+                for topic in CONTRACT
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [
+                {
+                    "path": file["path"],
+                    **span(file["first"], file["last"]),
+                    "message_count": sum(file["counts"].values()),
+                }
+                for file in self._files
+            ],
+            "custom_data": {SETTINGS: self._settings},
+            "ros_distro": "jazzy",
+        }
+
+
+def file_number(path: Path) -> int:
+    """Number of a file within its bag: 0 for ``NAME.mcap``, 1 for ``NAME_1.mcap``."""
+    digits = path.stem.rpartition("_")[2]
+    return int(digits) if path.stem != path.parent.name and digits.isdecimal() else 0
+
+
+def _new_file(path: Path) -> dict[str, Any]:
+    return {"path": path.name, "counts": {topic.name: 0 for topic in CONTRACT}, "first": 2**63 - 1, "last": 0}
 
 
 def clear_padding(message_type: str, payload: bytes) -> bytes:
@@ -125,15 +268,17 @@ def stamp_of(message_type: str, payload: bytes) -> int:
     return seconds * 1_000_000_000 + int.from_bytes(payload[offset + 4 : offset + 8], order)
 
 
-def _offered(topic: Topic) -> Qos:
-    return Qos(
-        history=QosHistory.KEEP_LAST,
-        depth=topic.depth,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL if topic.transient_local else QosDurability.VOLATILE,
-        deadline=_FOREVER,
-        lifespan=_FOREVER,
-        liveliness=QosLiveliness.AUTOMATIC,
-        liveliness_lease_duration=_FOREVER,
-        avoid_ros_namespace_conventions=False,
-    )
+def _offered(topic: Topic) -> dict[str, Any]:
+    """The quality of service that a topic's publisher offers, in rosbag2's words."""
+    forever = {"sec": 9223372036, "nsec": 854775807}
+    return {
+        "history": "keep_last",
+        "depth": topic.depth,
+        "reliability": "reliable",
+        "durability": "transient_local" if topic.transient_local else "volatile",
+        "deadline": dict(forever),
+        "lifespan": dict(forever),
+        "liveliness": "automatic",
+        "liveliness_lease_duration": dict(forever),
+        "avoid_ros_namespace_conventions": False,
+    }

@@ -1,6 +1,8 @@
 """Node ``episode_recorder``: records every topic of the graph into a rosbag2 folder, message by message as sent."""
 
 import signal
+import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -8,7 +10,7 @@ from typing import Any
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
-from active6d_bringup.bags.writer import EpisodeWriter
+from active6d_bringup.bags.writer import EpisodeWriter, RecordingError
 from active6d_core.ros.adaptive_subscription import AdaptiveSubscription
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
@@ -26,7 +28,9 @@ class EpisodeRecorderNode(GraphNode):
         super().__init__("episode_recorder", **options)
         self.declare("bag", "", "folder to create for the bag")
         self.declare("settings", "{}", "parameters of the other nodes as JSON, kept in metadata.yaml for replay")
+        self.declare("resume", False, "go on with the next file of a bag whose recorder was killed")
         self._writer: EpisodeWriter | None = None
+        self._stopped = ""
         self._subscriptions_by_topic = {topic.name: self._listen(topic) for topic in CONTRACT}
         self.create_service(Trigger, "~/complete", self._answer_complete)
 
@@ -41,17 +45,24 @@ class EpisodeRecorderNode(GraphNode):
         if not self._folder:
             raise ValueError("episode_recorder: parameter 'bag' must name a folder to create")
         names = {topic: each.subscription.topic_name for topic, each in self._subscriptions_by_topic.items()}
-        self._writer = EpisodeWriter(Path(self._folder).expanduser(), names, self.value("settings"))
+        folder, resume = Path(self._folder).expanduser(), self.value("resume")
+        self._writer = EpisodeWriter(folder, names, self.value("settings"), resume=resume)
+        self._stopped = ""
         self.get_logger().info(f"recording into {self._folder}")
 
     def teardown(self) -> None:
         """Write what is still queued and close the bag."""
-        if self._writer is not None:
-            self.drain()
-            self._writer.close()
-            if self.context.ok():
-                self.get_logger().info(f"{self._writer.message_count} messages in {self._folder}")
-            self._writer = None
+        self.drain()
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        try:
+            writer.close()
+        except RecordingError as error:
+            self.get_logger().error(str(error))
+            return
+        if self.context.ok():
+            self.get_logger().info(f"{writer.message_count} messages in {self._folder}")
 
     def destroy_node(self) -> None:
         """Close the bag, then destroy the node."""
@@ -78,13 +89,26 @@ class EpisodeRecorderNode(GraphNode):
         return AdaptiveSubscription(self, topic, partial(self._write, topic.name), qos, raw=True)
 
     def _write(self, topic: str, payload: bytes) -> None:
-        if self._writer is not None:
-            self._writer.write(topic, payload, self.get_clock().now().nanoseconds)
+        if self._writer is None:
+            return
+        try:
+            # The system's time, whatever use_sim_time is: a log time says when something was recorded.
+            self._writer.write(topic, payload, time.time_ns(), self.get_clock().now().nanoseconds)
+        except RecordingError as error:
+            self._stop(self._writer, str(error))
+
+    def _stop(self, writer: EpisodeWriter, reason: str) -> None:
+        """Close what there is and let the episode go on without a recording."""
+        self._writer, self._stopped = None, f"recording stopped: {reason}"
+        with suppress(RecordingError):
+            writer.close()
+        self.reject(self._stopped)
 
     def _answer_complete(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Whether the last episode that has ended is recorded completely."""
         if self._writer is None:
-            response.message = "not recording"
+            response.success = bool(self._stopped)  # nothing is awaited any more
+            response.message = self._stopped or "not recording"
             return response
         end = self._writer.last_end
         missing = [EPISODE_END.name] if end is None else self._writer.missing(end)

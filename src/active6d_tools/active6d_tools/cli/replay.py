@@ -77,6 +77,7 @@ def _run(settings: "ReplaySettings") -> "ReplayResult":
             return run_replay(
                 settings,
                 lambda done, total: progress.update(task, completed=done, total=total, description="replaying"),
+                lambda text: typer.echo(text, err=True),
             )
         except (EpisodeError, ProcessError) as error:
             failure, code = str(error), 1

@@ -39,6 +39,8 @@ def report(
         if episode >= len(records):
             raise ValueError(f"--episode {episode}: {folder} has {len(records)}, counted from 0")
         analysis = analyse(records[episode], object_name)
+    for line in records[0].damage:
+        typer.echo(f"{folder}: {line}", err=True)
     write_reports(analysis, output or folder / "report.html", png, figure)
     print_summary(analysis)
     write_json(json_file, analysis.summary())
