@@ -18,7 +18,15 @@ OFFSETS = [[5.0, 30.0, None, None], [5.0, 12.0, 1.0, None], [4.0, 12.0, 1.0, 21.
 def make_objects(T: np.ndarray, verification: np.ndarray) -> SceneObjects:
     n = len(T)
     return SceneObjects(
-        T, verification, verification, np.zeros((n, 4)), np.ones(n), np.arange(1, n + 1), np.full(n, 0.002)
+        T,
+        verification,
+        verification,
+        np.zeros((n, 4)),
+        np.ones(n),
+        np.arange(1, n + 1),
+        np.full(n, 0.002),
+        verification,
+        np.zeros(n),
     )
 
 

@@ -101,6 +101,8 @@ def _step(rng: np.random.Generator, stamp: int, T_world_camera: np.ndarray, goal
         depth=rng.uniform(0.5, 1.0, count),
         support=rng.integers(1, 6, count),
         spread=rng.random(count) * 0.01,
+        probability=rng.random(count),
+        entropy=rng.random(count),
     )
     color = rng.integers(0, 256, (*depth.shape, 3)).astype(np.uint8)
     view = View(stamp, color, depth, CAMERA, T_world_camera)

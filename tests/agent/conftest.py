@@ -40,6 +40,8 @@ def make_objects():
             depth=np.full(n, 0.8),
             support=np.ones(n, int),
             spread=np.zeros(n),
+            probability=np.full(n, 0.5),
+            entropy=np.zeros(n),
         )
 
     return make

@@ -60,7 +60,7 @@ with TemporaryDirectory() as folder:
     save_network(AttentionNetwork(), Path(folder) / "weights.safetensors")
     policy = create_policy("attention", SimpleNamespace(name="ball"), weights=f"{folder}/weights.safetensors")
 none = np.zeros(0)
-objects = SceneObjects(np.zeros((0, 4, 4)), none, none, np.zeros((0, 4)), none, none, none)
+objects = SceneObjects(np.zeros((0, 4, 4)), none, none, np.zeros((0, 4)), none, none, none, none, none)
 sphere = ViewSphere()
 decision = policy.decide(Observation(objects, sphere.positions[:1], sphere, np.ones(100, bool), 5))
 print(decision.view)

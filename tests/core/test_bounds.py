@@ -41,6 +41,8 @@ OBJECTS = SceneObjects(
     np.array([-0.5, 0.8]),
     np.array([1, 6]),
     np.array([0.0, 0.01]),
+    np.array([0.0, 1.0]),
+    np.array([0.0, 2.0]),
 )
 
 
@@ -81,7 +83,7 @@ def test_hypotheses_need_a_mask_and_a_place_before_the_camera():
 @pytest.mark.parametrize(
     ("column", "value"),
     [("verification", -7), ("score", 1e30), ("box", -1e30), ("depth", 1e30), ("support", 0), ("spread", -1)]
-    + [("support", 65535), ("spread", 1e30)],
+    + [("support", 65535), ("spread", 1e30), ("probability", -0.1), ("probability", 1.1), ("entropy", -1)],
 )
 def test_objects_out_of_bounds_are_named_also_in_messages(column, value):
     wrong = with_value(OBJECTS, column, value)

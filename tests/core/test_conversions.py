@@ -246,11 +246,28 @@ def test_objects_come_back(seed):
         rng.random(n),
         rng.integers(1, 7, n),
         rng.random(n) * 0.01,
+        rng.random(n),
+        rng.random(n),
     )
     back = conversions.objects_from_cloud(through_the_wire(conversions.objects_to_cloud(objects, 2, "world")), "world")
-    for column in ("T_world_object", "verification", "score", "box", "depth", "spread"):
+    for column in ("T_world_object", "verification", "score", "box", "depth", "spread", "probability", "entropy"):
         np.testing.assert_allclose(getattr(back, column), getattr(objects, column), atol=1e-6)
     np.testing.assert_array_equal(back.support, objects.support)
+
+
+def one_object(**columns):
+    ones = np.ones(1)
+    table = {name: ones for name in ("verification", "score", "depth", "spread", "probability", "entropy")}
+    return SceneObjects(
+        T_world_object=np.eye(4)[None], box=np.zeros((1, 4)), support=np.ones(1, int), **{**table, **columns}
+    )
+
+
+def test_objects_of_earlier_recordings_have_their_score_as_probability():
+    cloud = conversions.objects_to_cloud(one_object(score=np.array([0.25])), 2, "world")
+    cloud.fields = [field for field in cloud.fields if field.name not in ("probability", "entropy")]
+    back = conversions.objects_from_cloud(through_the_wire(cloud), "world")
+    assert (back.probability[0], back.entropy[0]) == (0.25, 0.0)
 
 
 @pytest.mark.parametrize("attended", [None, 2])
@@ -304,15 +321,17 @@ def test_latencies_are_read_from_our_nodes_only(value, hardware, expected):
     assert conversions.latencies_from_diagnostics(DiagnosticArray(status=[status])) == expected
 
 
-def test_markers_colour_by_verification_and_clear_the_last_ones():
+def test_markers_colour_by_probability_and_clear_the_last_ones():
     objects = SceneObjects(
         T_world_object=np.eye(4)[None].repeat(2, 0),
-        verification=np.array([0.0, 1.0]),
+        verification=np.array([1.0, 0.0]),
         score=np.zeros(2),
         box=np.zeros((2, 4)),
         depth=np.ones(2),
         support=np.ones(2, int),
         spread=np.zeros(2),
+        probability=np.array([0.0, 1.0]),
+        entropy=np.zeros(2),
     )
     clear, low, high = conversions.objects_to_markers(objects, "file:///mug.ply", 1, "world").markers
     assert clear.action == clear.DELETEALL

@@ -53,7 +53,15 @@ def test_shapes_are_checked():
         Hypotheses(np.zeros((1, 4, 4)), np.zeros(1), np.zeros((1, 4)), np.zeros(1), np.ones(1, np.uint16), np.zeros(2))
     with pytest.raises(ValueError, match="spread has shape"):
         SceneObjects(
-            np.zeros((1, 4, 4)), np.zeros(1), np.zeros(1), np.zeros((1, 4)), np.zeros(1), np.zeros(1), np.zeros(2)
+            np.zeros((1, 4, 4)),
+            np.zeros(1),
+            np.zeros(1),
+            np.zeros((1, 4)),
+            np.zeros(1),
+            np.zeros(1),
+            np.zeros(2),
+            np.zeros(1),
+            np.zeros(1),
         )
 
 
@@ -74,6 +82,8 @@ def scene_objects(n):
         rng.random((n, 4)),
         rng.random(n),
         np.arange(n),
+        rng.random(n),
+        rng.random(n),
         rng.random(n),
     )
 

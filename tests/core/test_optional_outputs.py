@@ -40,7 +40,8 @@ def test_detections_carry_pose_score_and_the_box_of_the_mesh(typestore, models):
     model = models["wedge"]
     T = make_transform(Rotation.random(2, rng=np.random.default_rng(0)).as_matrix(), np.eye(3)[:2])
     ones = np.ones(2)
-    objects = SceneObjects(T, np.array([0.25, 0.75]), ones, np.zeros((2, 4)), ones, np.ones(2, int), ones)
+    probability = np.array([0.25, 0.75])
+    objects = SceneObjects(T, ones, ones, np.zeros((2, 4)), ones, np.ones(2, int), ones, probability, ones)
     sent = detections_message(messages, objects, model, 3_000_000_001, "world")
     got = through_the_wire(typestore, sent, "vision_msgs/msg/Detection3DArray")
     assert (got.header.frame_id, got.header.stamp.sec, got.header.stamp.nanosec) == ("world", 3, 1)

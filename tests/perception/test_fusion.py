@@ -13,7 +13,7 @@ from active6d_core.se3 import invert, make_transform, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
-from active6d_perception.scene import fusion as fusion_module
+from active6d_perception.scene import hypothesis_table
 from active6d_perception.scene.clustering import cluster_groups
 from active6d_perception.scene.fusion import FusionParameters, SceneFusion, cluster, project_features, select
 
@@ -230,7 +230,7 @@ def test_a_large_group_is_clustered_alike():
 
 
 def test_scattered_hypotheses_without_end_keep_their_cost(monkeypatch):
-    monkeypatch.setattr(fusion_module, "MOST_HYPOTHESES", 100)
+    monkeypatch.setattr(hypothesis_table, "MOST_HYPOTHESES", 100)
     fusion, T_world_camera = SceneFusion(load_object("mug")), ViewSphere().pose(ViewSphere().positions[40])
     rng, best = np.random.default_rng(0), 0.0
     for stamp in range(1, 21):
@@ -240,7 +240,7 @@ def test_scattered_hypotheses_without_end_keep_their_cost(monkeypatch):
         fusion.add_view(stamp, T_world_camera, hypotheses, np.full(20, 0.5))
         best = max(best, hypotheses.score.max())
     objects = fusion.objects(20, T_world_camera, DEFAULT_CAMERA)
-    assert len(fusion._distances) == 100
+    assert len(fusion._known.distances) == 100
     assert objects.score.max() == best  # the best are kept, whenever they came
 
 

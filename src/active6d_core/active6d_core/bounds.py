@@ -18,6 +18,8 @@ MOST_PIXELS = 3_200_000
 FARTHEST = 100.0
 #: Views of one episode; the policy's largest budget of moves, and the first view.
 MOST_VIEWS = 10_001
+# Of a belief; it would need more poses than can be numbered.
+_MOST_NATS = 100.0
 #: Rounding of numbers that were float32 on their way.
 _ROUNDING = 1e-4
 
@@ -115,6 +117,8 @@ def check_objects(objects: SceneObjects) -> None:
     _check("position", np.abs(objects.T_world_object[:, :3, 3]), 0.0, FARTHEST)
     _check("support", objects.support, 1, MOST_VIEWS)
     _check("spread", objects.spread, 0.0, FARTHEST)
+    _check("probability", objects.probability, 0.0, 1.0)
+    _check("entropy", objects.entropy, 0.0, _MOST_NATS)
 
 
 def check_points(points: np.ndarray) -> None:

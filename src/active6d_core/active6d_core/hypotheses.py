@@ -119,6 +119,9 @@ class SceneObjects:
         depth: (n,) metres along z in the current camera (paper: d).
         support: (n,) int, number of views with a hypothesis in the object's cluster.
         spread: (n,) largest distance between the cluster's hypotheses, metres (0 with one hypothesis).
+        probability: (n,) in [0, 1], that the ADD of the pose is below 10 % of the diameter.
+        entropy: (n,) of the belief over the poses that are possible at the object's place, nats; 0 if only one was
+            considered.
 
     Raises:
         ValueError: array shapes disagree.
@@ -131,6 +134,8 @@ class SceneObjects:
     depth: np.ndarray
     support: np.ndarray
     spread: np.ndarray
+    probability: np.ndarray
+    entropy: np.ndarray
 
     def __post_init__(self) -> None:
         n = len(self.verification)
@@ -147,7 +152,7 @@ class SceneObjects:
     def empty(cls) -> "SceneObjects":
         """A table without objects."""
         none = np.zeros(0)
-        return cls(np.zeros((0, 4, 4)), none, none, np.zeros((0, 4)), none, np.zeros(0, int), none)
+        return cls(np.zeros((0, 4, 4)), none, none, np.zeros((0, 4)), none, np.zeros(0, int), none, none, none)
 
     def features(self) -> np.ndarray:
         """(n, 6) box, depth and verification score: the tuple (b, d, c) of the paper's attention module."""

@@ -226,6 +226,8 @@ class BatchedFusion:
                 depth=feature[:, 4],
                 support=support[leaders],
                 spread=spread[leaders],
+                probability=self.score[rows],
+                entropy=np.zeros(len(rows)),
             )
             described.append(objects)
         return described

@@ -37,7 +37,11 @@ OBJECT_COLUMNS = {
     "depth": "<f4",
     "support": "<u2",
     "spread": "<f4",
+    "probability": "<f4",
+    "entropy": "<f4",
 }
+_OBJECT_NUMBERS = ("verification", "score", "depth", "spread")
+_BELIEF_COLUMNS = ("probability", "entropy")
 POINT_COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4"}
 ATTENTION_COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4", "weight": "<f4", "attended": "|u1"}
 
@@ -351,7 +355,7 @@ def objects_to_cloud(objects: SceneObjects, stamp: int, frame: str) -> PointClou
     table = np.zeros(len(objects), _layout(OBJECT_COLUMNS))
     _fill_poses(table, objects.T_world_object)
     _fill_box(table, objects.box)
-    for column in ("verification", "score", "depth", "support", "spread"):
+    for column in (*_OBJECT_NUMBERS, *_BELIEF_COLUMNS, "support"):
         table[column] = getattr(objects, column)
     return _table_to_cloud(table, stamp, frame)
 
@@ -359,15 +363,21 @@ def objects_to_cloud(objects: SceneObjects, stamp: int, frame: str) -> PointClou
 def objects_from_cloud(message: PointCloud2, frame: str) -> SceneObjects:
     """A table of accumulated objects to SceneObjects.
 
+    Recordings of earlier versions have no probability and no entropy: the score and 0 stand for them.
+
     Raises:
         MessageError: another frame, a missing column or a number out of its bounds.
     """
-    table = _cloud_to_table(message, OBJECT_COLUMNS, frame)
+    required = {name: dtype for name, dtype in OBJECT_COLUMNS.items() if name not in _BELIEF_COLUMNS}
+    believes = {field.name for field in message.fields}.issuperset(_BELIEF_COLUMNS)
+    table = _cloud_to_table(message, OBJECT_COLUMNS if believes else required, frame)
     objects = SceneObjects(
         T_world_object=_read_poses(table),
         box=_read_box(table),
         support=table["support"].astype(int),
-        **{column: _read(table, column) for column in ("verification", "score", "depth", "spread")},
+        probability=_read(table, "probability" if believes else "score"),
+        entropy=_read(table, "entropy") if believes else np.zeros(len(table)),
+        **{column: _read(table, column) for column in _OBJECT_NUMBERS},
     )
     with refusing():
         check_objects(objects)
@@ -524,18 +534,18 @@ def latencies_from_diagnostics(message: DiagnosticArray) -> dict[str, float]:
 
 
 def objects_to_markers(objects: SceneObjects, mesh_uri: str, stamp: int, frame: str) -> MarkerArray:
-    """One mesh per object, from red (verification score 0) to green (1), after one marker that clears the last ones."""
+    """One mesh per object, from red (probability 0) to green (1), after one marker that clears the last ones."""
     header = make_header(stamp, frame)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
     # Copies share all that is alike: making a new Marker costs ten times as much.
     alike = Marker(header=header, ns="objects", type=Marker.MESH_RESOURCE, mesh_resource=mesh_uri)
     alike.scale = Vector3(x=1.0, y=1.0, z=1.0)
     poses = _transforms_to_poses(objects.T_world_object)
-    for index, (pose, verification) in enumerate(zip(poses, objects.verification, strict=True)):
+    for index, (pose, probability) in enumerate(zip(poses, objects.probability, strict=True)):
         marker = copy(alike)
         marker.id = index
         marker.pose = pose
-        certainty = float(np.clip(verification, 0.0, 1.0))
-        marker.color = ColorRGBA(r=1.0 - certainty, g=certainty, b=0.1, a=0.8)
+        green = float(np.clip(probability, 0.0, 1.0))
+        marker.color = ColorRGBA(r=1.0 - green, g=green, b=0.1, a=0.8)
         markers.append(marker)
     return MarkerArray(markers=markers)

@@ -45,7 +45,7 @@ class DetectionOutput:
         self._publisher = node.output(DETECTIONS) if self._messages else None
 
     def publish(self, objects: SceneObjects, model: ObjectModel, stamp: int, frame: str) -> None:
-        """Send objects whose poses are in ``frame``; the score of a detection is its verification score."""
+        """Send objects whose poses are in ``frame``; the score of a detection is its probability of being right."""
         if self._publisher is not None:
             self._publisher.publish(detections_message(self._messages, objects, model, stamp, frame))
 
@@ -73,8 +73,8 @@ def detections_message(messages: Any, objects: SceneObjects, model: ObjectModel,
     T_object_box = np.eye(4)
     T_object_box[:3, 3] = (low + high) / 2
     detections = []
-    for index, (T, verification) in enumerate(zip(objects.T_world_object, objects.verification, strict=True)):
-        hypothesis = messages.ObjectHypothesis(class_id=model.name, score=float(verification))
+    for index, (T, probability) in enumerate(zip(objects.T_world_object, objects.probability, strict=True)):
+        hypothesis = messages.ObjectHypothesis(class_id=model.name, score=float(probability))
         pose = PoseWithCovariance(pose=transform_to_pose(T))
         result = messages.ObjectHypothesisWithPose(hypothesis=hypothesis, pose=pose)
         box = messages.BoundingBox3D(center=transform_to_pose(T @ T_object_box), size=size)

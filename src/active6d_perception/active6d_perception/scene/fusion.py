@@ -17,12 +17,9 @@ from active6d_perception.compiled import compiled
 from active6d_perception.model.model_views import ModelViews, model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.scene.clustering import cluster
+from active6d_perception.scene.hypothesis_table import HypothesisTable, confidence
 from active6d_perception.scene.observed_surface import EXPLAINED_WITHIN
 from active6d_perception.suppression import suppress_neighbours
-
-#: Hypotheses kept of all views, the best; 18 objects in 100 views have 1800. Without a limit an episode could use up
-#: any time and memory.
-MOST_HYPOTHESES = 2500
 
 #: Ways to rank hypotheses, see :class:`FusionParameters`.
 RANKINGS = ("evidence", "confidence", "verification", "score")
@@ -119,11 +116,6 @@ def summarise(
     return support, spread, current
 
 
-def confidence(verification: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """(k,) in [0, 2]: the verification score plus 1, times the estimator's score."""
-    return (1.0 + verification) * score
-
-
 def evidence(verification: np.ndarray, score: np.ndarray, parameters: FusionParameters) -> np.ndarray | None:
     """(k,) evidence of each hypothesis for its cluster; None if clusters are ranked by their best hypothesis."""
     return confidence(verification, score) ** 2 if parameters.rank_by == "evidence" else None
@@ -185,71 +177,25 @@ class SceneFusion:
     def __init__(self, model: ObjectModel, parameters: FusionParameters | None = None) -> None:
         self.parameters = parameters or FusionParameters()
         self._diameter = model.diameter
-        self._distance = SymmetricDistance(model)
         self._views = model_views(model)
-        self.reset()
+        self._known = HypothesisTable(SymmetricDistance(model).between)
         # Compile now, so that no view has to wait.
         nothing = np.zeros(0, np.int64)
         summarise(nothing, nothing, nothing, np.zeros((0, 0)), 0)
 
     def reset(self) -> None:
         """Forget all views."""
-        self._stamps: list[int] = []
-        self._stamp = np.zeros(0, np.int64)
-        self._T_world_object = np.zeros((0, 4, 4))
-        # Columns: verification, score, box (4), depth.
-        self._table = np.zeros((0, 7))
-        self._distances = np.zeros((0, 0))
+        self._known.reset()
 
     def forget_before(self, stamp: int) -> None:
         """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
-        first = self._stamps.index(stamp) if stamp in self._stamps else len(self._stamps)
-        self._stamps = self._stamps[first:]
-        self._keep(np.flatnonzero(np.isin(self._stamp, self._stamps)))
-
-    def _keep(self, kept: np.ndarray) -> None:
-        """Keep the hypotheses at these indices."""
-        self._stamp, self._table = self._stamp[kept], self._table[kept]
-        self._T_world_object = self._T_world_object[kept]
-        self._distances = self._distances[np.ix_(kept, kept)]
+        self._known.forget_before(stamp)
 
     def add_view(
         self, stamp: int, T_world_camera: np.ndarray, hypotheses: Hypotheses, verification: np.ndarray
     ) -> bool:
-        """Add the hypotheses of one view.
-
-        Args:
-            stamp: nanoseconds; identifies the view.
-            T_world_camera: (4, 4) pose of the optical frame, metres.
-            hypotheses: k hypotheses.
-            verification: (k,) verification scores of the hypotheses (equation 1).
-
-        Returns:
-            False if the view had been added before, and nothing has changed.
-
-        Raises:
-            ValueError: the numbers of scores and hypotheses differ.
-        """
-        if len(verification) != len(hypotheses):
-            raise ValueError(f"fusion: {len(verification)} verification scores for {len(hypotheses)} hypotheses")
-        if stamp in self._stamps:
-            return False
-        T = T_world_camera @ hypotheses.T_camera_object
-        known = len(self._T_world_object)
-        self._T_world_object = np.concatenate([self._T_world_object, T])
-        distances = np.empty((len(self._T_world_object),) * 2)
-        distances[:known, :known] = self._distances
-        distances[known:] = self._distance.between(T, self._T_world_object)
-        distances[:known, known:] = distances[known:, :known].T
-        self._distances = distances
-        row = np.column_stack([verification, hypotheses.score, hypotheses.box, hypotheses.depth])
-        self._stamps.append(stamp)
-        self._stamp = np.append(self._stamp, np.full(len(T), stamp))
-        self._table = np.concatenate([self._table, row])
-        if len(self._table) > MOST_HYPOTHESES:
-            worth = confidence(self._table[:, 0], self._table[:, 1])
-            self._keep(np.sort(np.argsort(-worth, kind="stable")[:MOST_HYPOTHESES]))
-        return True
+        """Add the hypotheses of one view; see :meth:`.HypothesisTable.add_view`."""
+        return self._known.add_view(stamp, T_world_camera, hypotheses, verification)
 
     def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
         """The objects of all views so far, best first, with features in one camera.
@@ -262,15 +208,18 @@ class SceneFusion:
             T_world_camera: (4, 4) pose of the current camera's optical frame, metres.
             camera: its intrinsics.
         """
-        order = preference(self._table[:, 0], self._table[:, 1], self._T_world_object, self.parameters)
+        known = self._known
+        order = preference(known.table[:, 0], known.table[:, 1], known.T_world_object, self.parameters)
         if not len(order):
             return SceneObjects.empty()
-        T, table, stamps = self._T_world_object[order], self._table[order], self._stamp[order]
-        distance = self._distances.take(order, axis=0).take(order, axis=1)
+        T, table, stamps = known.T_world_object[order], known.table[order], known.stamp[order]
+        distance = known.distances.take(order, axis=0).take(order, axis=1)
         labels = cluster(distance, self.parameters.cut * self._diameter)
         weight = evidence(table[:, 0], table[:, 1], self.parameters)
         chosen = select(labels, weight, T[:, :3, 3], self.parameters.exclusion * self._diameter)
         box, depth = project_features(self._views, invert(T_world_camera) @ T[chosen], camera)
         support, spread, seen = summarise(labels, chosen, stamps, distance, stamp)
         box[seen >= 0], depth[seen >= 0] = table[seen[seen >= 0], 2:6], table[seen[seen >= 0], 6]
-        return SceneObjects(T[chosen], table[chosen, 0], table[chosen, 1], box, depth, support, spread)
+        score = table[chosen, 1]
+        nothing = np.zeros(len(chosen))
+        return SceneObjects(T[chosen], table[chosen, 0], score, box, depth, support, spread, score, nothing)

@@ -1,0 +1,131 @@
+"""What is ambiguous about an object's pose, and which part of its surface shows it.
+
+Fusion separates a pose into a *body* and a rotation. The body is what near symmetries leave as it is: a mug without its
+handle. Rotations about the axis of near symmetry are alternatives of one body. Discrete twins, such as upside down, are
+bodies of their own, because they differ in more of the surface and are refined each to its own pose.
+"""
+
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from active6d_core.object_model import ObjectModel, Symmetry
+from active6d_core.se3 import transform_points
+from active6d_perception.model.model_views import model_views
+from active6d_perception.model.near_symmetry import near_symmetries, telling_surface
+from active6d_perception.model.symmetric_distance import SymmetricDistance
+from active6d_perception.model.visible_samples import VisibleSamples, visible_samples
+from active6d_perception.scene.solid import Solid, solid_of
+
+# Rotations about an axis of near symmetry, 10 degrees apart.
+_ROTATIONS = 36
+# A point tells rotations apart if at least this share of them puts no surface there.
+_TELLING = 0.5
+_TELLING_SAMPLES, _BODY_SAMPLES = 64, 192
+
+
+@lru_cache(maxsize=16)
+def ambiguity_of(model: ObjectModel) -> "Ambiguity":
+    """The ambiguity of ``model``, computed once per process in about two seconds."""
+    return Ambiguity(model)
+
+
+class Ambiguity:
+    """Twins, rotations and the parts of one object's surface.
+
+    Attributes:
+        model: the object.
+        views: its precomputed views.
+        twins: (t, 4, 4) ``T_object_twin``, the identity first: discrete near symmetries.
+        rotations: (r, 4, 4) ``T_object_rotated`` about the axis of near symmetry, the identity first and alone without
+            such an axis.
+        telling: (s,) bool, which samples of ``views`` tell the rotations apart.
+        middle: (3,) middle of the body, which rotations leave in place; object frame, metres.
+        diameter: of the object, metres.
+    """
+
+    def __init__(self, model: ObjectModel) -> None:
+        self.model, self.views, self.diameter = model, model_views(model), model.diameter
+        near = self._near = near_symmetries(model)
+        self.twins = near.T_object_twin
+        self.rotations, self.telling = np.eye(4)[None], np.zeros(len(self.views.points), bool)
+        if near.T_object_axis is not None:
+            self.rotations = near.rotations_about_axis(np.arange(_ROTATIONS) * 2 * np.pi / _ROTATIONS)
+            tells = telling_surface(model, self.rotations[1:], self.views.points, self.views.normals)
+            self.telling = tells.mean(axis=0) > _TELLING
+        body = self.views.points[~self.telling].astype(float)
+        # Averaged over the rotations: the body's samples are not spread exactly evenly about the axis.
+        self.middle = transform_points(self.rotations, 0.5 * (body.min(axis=0) + body.max(axis=0))[None]).mean(
+            axis=(0, 1)
+        )
+
+    @cached_property
+    def rotation_errors(self) -> np.ndarray:
+        """(r, r) ADD between two rotations of one body, metres."""
+        points = transform_points(
+            self.rotations, self.model.error_points[:: max(1, len(self.model.error_points) // 400)]
+        )
+        return np.stack([np.linalg.norm(points - own, axis=-1).mean(axis=1) for own in points])
+
+    def mean_rotation(self, weight: np.ndarray) -> np.ndarray:
+        """(n, 4, 4) ``T_object_rotated``: the means of the rotations, weighted by (n, r) of similar ones."""
+        if len(self.rotations) == 1:
+            return np.tile(np.eye(4), (len(weight), 1, 1))
+        angles = np.arange(len(self.rotations)) * 2 * np.pi / len(self.rotations)
+        return self._near.rotations_about_axis(np.arctan2(weight @ np.sin(angles), weight @ np.cos(angles)))
+
+    @cached_property
+    def body_distance(self) -> "BodyDistance":
+        """Distance between bodies."""
+        return BodyDistance(self.model, self._near.T_object_axis)
+
+    @cached_property
+    def solid(self) -> Solid:
+        """What is solid at every rotation."""
+        return solid_of(self.model, self.rotations[:: max(1, len(self.rotations) // 12)])
+
+    @cached_property
+    def telling_points(self) -> np.ndarray:
+        """(p, 3) points of the surface that tells rotations apart, evenly spaced, object frame, metres."""
+        return self._spread(self.telling, _TELLING_SAMPLES)
+
+    @cached_property
+    def body_points(self) -> np.ndarray:
+        """(p, 3) points of the surface that does not, evenly spaced, object frame, metres."""
+        return self._spread(~self.telling, _BODY_SAMPLES)
+
+    def _spread(self, part: np.ndarray, count: int) -> np.ndarray:
+        among = np.flatnonzero(part)
+        chosen = among[np.linspace(0, len(among) - 1, min(count, len(among))).astype(np.intp)]
+        return self.views.points[chosen].astype(float)
+
+    @cached_property
+    def body_samples(self) -> VisibleSamples:
+        """Of the surface that does not tell rotations apart."""
+        return visible_samples(self.views, ~self.telling, _BODY_SAMPLES, self.model.mesh.area)
+
+    @cached_property
+    def telling_samples(self) -> VisibleSamples:
+        """Of the surface that tells rotations apart."""
+        return visible_samples(self.views, self.telling, _TELLING_SAMPLES, self.model.mesh.area)
+
+    @cached_property
+    def all_samples(self) -> VisibleSamples:
+        """Of the whole surface."""
+        return visible_samples(self.views, np.ones(len(self.telling), bool), _BODY_SAMPLES, self.model.mesh.area)
+
+
+class BodyDistance:
+    """:class:`.SymmetricDistance` between poses, least over the rotations about the axis of near symmetry."""
+
+    def __init__(self, model: ObjectModel, T_object_axis: np.ndarray | None) -> None:
+        self._T_object_axis = np.eye(4) if T_object_axis is None else T_object_axis
+        symmetry = model.symmetry
+        if T_object_axis is not None:
+            symmetry = Symmetry(np.array([0.0, 0.0, 1.0]), np.eye(3)[None])
+        points = transform_points(np.linalg.inv(self._T_object_axis), model.surface[0])
+        self._distance = SymmetricDistance.of_points(points, symmetry)
+
+    def between(self, T_a: np.ndarray, T_b: np.ndarray) -> np.ndarray:
+        """(n, m) distances in metres between (n, 4, 4) and (m, 4, 4) object poses in one frame."""
+        return self._distance.between(T_a @ self._T_object_axis, T_b @ self._T_object_axis)

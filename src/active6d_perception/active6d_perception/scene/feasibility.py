@@ -1,0 +1,94 @@
+"""Whether a pose can be: solid objects do not overlap, nor cut the floor or the walls of their container."""
+
+import numpy as np
+
+from active6d_perception.compiled import compiled
+from active6d_perception.scene.expected_visibility import Tray
+from active6d_perception.scene.solid import Solid, signed_distance
+
+# Poses are some millimetres off, so that points this deep inside still count as touching; metres.
+_INTO_CONTAINER, _INTO_NEIGHBOUR = 0.003, 0.0015
+#: Columns of :func:`against_container`.
+CONTAINER_COLUMNS = ("share below the floor", "lowest height", "share beyond a wall", "farthest beyond", "mean height")
+#: Columns of :func:`against_neighbour`.
+NEIGHBOUR_COLUMNS = ("share inside", "least distance")
+#: Distance to a neighbour that is not near, metres.
+FREE = 0.05
+
+
+@compiled
+def against_container(T_world_object: np.ndarray, rotations: np.ndarray, points: np.ndarray, tray: Tray) -> np.ndarray:
+    """Compare points of an object with the floor and the walls around it.
+
+    Args:
+        T_world_object: (k, 4, 4) metres.
+        rotations: (r, 4, 4) ``T_object_rotated``.
+        points: (p, 3) object frame, metres.
+        tray: the walls; the floor is at z = 0.
+
+    Returns:
+        (k, r, 5) of :data:`CONTAINER_COLUMNS`, metres. A point is below or beyond by more than 3 mm; the farthest is
+        negative inside. All are 0 without points.
+    """
+    result = np.zeros((len(T_world_object), len(rotations), 5))
+    half, count = 0.5 * tray.width, len(points)
+    for k in range(len(T_world_object)):
+        for r in range(len(rotations)):
+            T, row = T_world_object[k] @ rotations[r], result[k, r]
+            row[1], row[3] = (np.inf, -np.inf) if count else (0.0, 0.0)
+            for p in range(count):
+                a, b, c = points[p, 0], points[p, 1], points[p, 2]
+                x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+                y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+                z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+                beyond = max(abs(x), abs(y)) - half if z < tray.wall_height else -1.0
+                row[0] += z < -_INTO_CONTAINER
+                row[1] = min(row[1], z)
+                row[2] += beyond > _INTO_CONTAINER
+                row[3] = max(row[3], beyond)
+                row[4] += z
+            for column in (0, 2, 4):
+                row[column] /= max(count, 1)
+    return result
+
+
+@compiled
+def against_neighbour(
+    T_world_object: np.ndarray, T_world_neighbour: np.ndarray, rotations: np.ndarray, points: np.ndarray, solid: Solid
+) -> np.ndarray:
+    """Compare points of each object with the solid of one neighbour.
+
+    Args:
+        T_world_object: (k, 4, 4) metres.
+        T_world_neighbour: (k, 4, 4) metres.
+        rotations: (r, 4, 4) ``T_object_rotated`` of the object.
+        points: (p, 3) object frame, metres.
+        solid: of the neighbour.
+
+    Returns:
+        (k, r, 2): the share of the points more than 1.5 mm inside of the neighbour, and the least signed distance from
+        it, at most 50 mm, metres.
+    """
+    result = np.zeros((len(T_world_object), len(rotations), 2))
+    result[:, :, 1] = FREE
+    for k in range(len(T_world_object)):
+        N = T_world_neighbour[k]
+        for r in range(len(rotations)):
+            T, row = T_world_object[k] @ rotations[r], result[k, r]
+            for p in range(len(points)):
+                a, b, c = points[p, 0], points[p, 1], points[p, 2]
+                x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3] - N[0, 3]
+                y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3] - N[1, 3]
+                z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - N[2, 3]
+                if x * x + y * y + z * z > solid.reach * solid.reach:
+                    continue
+                distance = signed_distance(
+                    x * N[0, 0] + y * N[1, 0] + z * N[2, 0],
+                    x * N[0, 1] + y * N[1, 1] + z * N[2, 1],
+                    x * N[0, 2] + y * N[1, 2] + z * N[2, 2],
+                    solid,
+                )
+                row[0] += distance < -_INTO_NEIGHBOUR
+                row[1] = min(row[1], distance)
+            row[0] /= max(len(points), 1)
+    return result

@@ -1,0 +1,297 @@
+"""Fusion that weighs every view: bodies refined over all depth images, and a belief over what is ambiguous.
+
+:class:`.SceneFusion` keeps the best hypothesis of a single view. This fusion takes hypotheses only as proposals. What
+every depth image measured at a candidate's place decides: the surface where it should be, something before it, or a
+look through it. And solid objects cannot overlap.
+
+Everything follows from the set of views: their order changes nothing. What a view says of a pose is computed once and
+remembered (:mod:`.memo`), so another view costs its own part.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from active6d_core.camera import PinholeCamera
+from active6d_core.hypotheses import Hypotheses, SceneObjects
+from active6d_core.metrics import DETECTION_FRACTION
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import invert, transform_points
+from active6d_perception.scene.ambiguity import Ambiguity, ambiguity_of
+from active6d_perception.scene.belief_weights import BeliefWeights, belief_path, load_belief
+from active6d_perception.scene.body_candidates import BodyCandidates, gather_candidates, merge_duplicates
+from active6d_perception.scene.body_refinement import BodyRefinement
+from active6d_perception.scene.clustering import cluster
+from active6d_perception.scene.expected_visibility import Tray
+from active6d_perception.scene.feasibility import FREE, against_container, against_neighbour
+from active6d_perception.scene.fusion import FusionParameters, preference, project_features
+from active6d_perception.scene.hypothesis_table import HypothesisTable, confidence
+from active6d_perception.scene.measured_cases import CASES, count_cases
+from active6d_perception.scene.measured_view import MeasuredView, measure_view
+from active6d_perception.scene.memo import Memo
+from active6d_perception.scene.object_probability import describe_objects, object_probability
+from active6d_perception.scene.pose_lattice import round_poses
+from active6d_perception.scene.rotation_belief import PlaceBeliefs, decide, posterior
+from active6d_perception.scene.scene_evidence import SceneEvidence
+from active6d_perception.suppression import suppress_neighbours
+
+# An instance whose body's middle is nearer than this to a candidate's is the candidate's own, diameters.
+_OWN = 0.25
+# Bodies whose middles are farther apart than this do not touch, diameters.
+_BESIDE = 1.3
+_LAST_GATES = (0.004,)  # metres, of refining the whole object
+
+
+@dataclass(frozen=True, eq=False)
+class _SeenView:
+    measured: MeasuredView
+    memo: Memo
+
+
+@dataclass(frozen=True, eq=False)
+class JointObjects:
+    """Fused objects with what is known of them, best first.
+
+    Attributes:
+        objects: their table.
+        description: (n, columns) see :func:`.describe_objects`.
+    """
+
+    objects: SceneObjects
+    description: np.ndarray
+
+
+class JointFusion:
+    """Accumulates views and computes the objects of the scene from all of them.
+
+    Args:
+        model: the object.
+        parameters: settings shared with :class:`.SceneFusion`.
+        weights: of the belief; those of the object when None.
+        tray: floor and walls; those of the object's usual bin when None.
+    """
+
+    def __init__(
+        self,
+        model: ObjectModel,
+        parameters: FusionParameters | None = None,
+        weights: BeliefWeights | None = None,
+        tray: Tray | None = None,
+    ) -> None:
+        self.parameters = parameters or FusionParameters()
+        self.ambiguity: Ambiguity = ambiguity_of(model)
+        self.weights = weights or load_belief(belief_path(model.name))
+        self._tray = tray or Tray.for_model(model)
+        self._known = HypothesisTable(self.ambiguity.body_distance.between)
+        self._bodies = BodyRefinement(self.ambiguity.body_samples)
+        self._whole = BodyRefinement(self.ambiguity.all_samples, _LAST_GATES)
+        self.reset()
+
+    @property
+    def views(self) -> dict[int, MeasuredView]:
+        """What is kept of each view, by its stamp."""
+        return {stamp: view.measured for stamp, view in self._views.items()}
+
+    def reset(self) -> None:
+        """Forget all views."""
+        self._known.reset()
+        self._views: dict[int, _SeenView] = {}
+        self._feasible = Memo()
+
+    def forget_before(self, stamp: int) -> None:
+        """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
+        self._known.forget_before(stamp)
+        self._views = {known: self._views[known] for known in self._known.stamps}
+
+    def add_view(
+        self,
+        stamp: int,
+        T_world_camera: np.ndarray,
+        hypotheses: Hypotheses,
+        verification: np.ndarray,
+        depth: np.ndarray,
+        camera: PinholeCamera,
+    ) -> bool:
+        """Add one view; arguments as for :meth:`.HypothesisTable.add_view` and :func:`.measure_view`.
+
+        Returns:
+            False if the view had been added before, and nothing has changed.
+        """
+        measured = measure_view(depth, camera, T_world_camera, hypotheses, self.ambiguity)
+        if not self._known.add_view(stamp, T_world_camera, hypotheses, verification):
+            return False
+        self._views[stamp] = _SeenView(measured, Memo())
+        return True
+
+    def evidence(self) -> SceneEvidence:
+        """What all views say of every candidate."""
+        order = self._order()
+        candidates = self._candidates(order)
+        ambiguity, identity = self.ambiguity, np.eye(4)[None]
+        rounded, keys = round_poses(candidates.T_world_object)
+        heads = candidates.heads()
+
+        def container(rotations: np.ndarray, points: np.ndarray) -> np.ndarray:
+            kind = "container", len(points)
+            return self._feasible.rows(
+                [(*kind, key) for key in keys],
+                lambda missing: against_container(rounded[missing], rotations, points, self._tray),
+            )
+
+        evidence = SceneEvidence(
+            candidates=candidates,
+            telling=self._count("telling", rounded, keys),
+            body=self._count("body", rounded, keys)[:, 0],
+            container=container(ambiguity.rotations, ambiguity.telling_points),
+            body_container=container(identity, ambiguity.body_points)[:, 0],
+            neighbours=self._overlaps(candidates, rounded, keys, heads, ambiguity.rotations, ambiguity.telling_points),
+            body_neighbours=self._overlaps(candidates, rounded, keys, heads, identity, ambiguity.body_points)[:, 0],
+            diameter=ambiguity.diameter,
+        )
+        for memo in (self._feasible, *(view.memo for view in self._views.values())):
+            memo.sweep()
+        return evidence
+
+    def _order(self) -> np.ndarray:
+        known = self._known
+        return preference(known.table[:, 0], known.table[:, 1], known.T_world_object, self.parameters)
+
+    def _sorted_views(self) -> list[_SeenView]:
+        return [self._views[stamp] for stamp in sorted(self._views)]
+
+    def _candidates(self, order: np.ndarray) -> BodyCandidates:
+        known, ambiguity = self._known, self.ambiguity
+        distances = known.distances.take(order, axis=0).take(order, axis=1)
+        labels = cluster(distances, self.parameters.cut * ambiguity.diameter) if len(order) else order
+        table = known.table[order]
+        squared = confidence(table[:, 0], table[:, 1]) ** 2
+        found = gather_candidates(labels, known.T_world_object[order], squared, ambiguity)
+        views = [(view.measured, view.memo) for view in self._sorted_views()]
+        refined = BodyCandidates(
+            self._bodies.refine(found.T_world_object, views), found.place, found.evidence, found.twin
+        )
+        return merge_duplicates(refined, ambiguity)
+
+    def _count(self, part: str, rounded: np.ndarray, keys: list[bytes]) -> np.ndarray:
+        """(K, r or 1, CASES) counts over all views."""
+        ambiguity = self.ambiguity
+        telling = part == "telling"
+        samples = ambiguity.telling_samples if telling else ambiguity.body_samples
+        rotations = ambiguity.rotations if telling else np.eye(4)[None]
+        total = np.zeros((len(keys), len(rotations), CASES), np.int64)
+        if telling and len(rotations) == 1:
+            return total
+        for view in self._views.values():
+
+            def compute(missing: np.ndarray, view: _SeenView = view) -> np.ndarray:
+                place = _OWN * ambiguity.diameter
+                return count_cases(rounded[missing], rotations, ambiguity.middle, place, samples, view.measured)
+
+            total += view.memo.rows([(part, key) for key in keys], compute)
+        return total
+
+    def _overlaps(
+        self,
+        candidates: BodyCandidates,
+        rounded: np.ndarray,
+        keys: list[bytes],
+        heads: np.ndarray,
+        rotations: np.ndarray,
+        points: np.ndarray,
+    ) -> np.ndarray:
+        """(K, r, 2) overlap of each candidate's points with the most evident bodies of other places."""
+        ambiguity, solid = self.ambiguity, self.ambiguity.solid
+        total = np.zeros((len(keys), len(rotations), 2))
+        total[..., 1] = np.inf
+        middles = transform_points(rounded, ambiguity.middle[None])[:, 0]
+        apart = np.linalg.norm(middles[:, None] - middles[heads], axis=-1)
+        other = candidates.place[:, None] != candidates.place[heads]
+        own, neighbour = np.nonzero(other & (apart < _BESIDE * ambiguity.diameter))
+        neighbour = heads[neighbour]
+
+        def compute(missing: np.ndarray) -> np.ndarray:
+            pair = own[missing], neighbour[missing]
+            return against_neighbour(rounded[pair[0]], rounded[pair[1]], rotations, points, solid)
+
+        rows = self._feasible.rows(
+            [(len(points), keys[a], keys[b]) for a, b in zip(own, neighbour, strict=True)], compute
+        )
+        if len(own):
+            np.add.at(total[..., 0], own, rows[..., 0])
+            np.minimum.at(total[..., 1], own, rows[..., 1])
+        total[..., 0] = np.minimum(total[..., 0], 1.0)
+        total[..., 1] = np.minimum(total[..., 1], FREE)
+        return total
+
+    def believe(self, evidence: SceneEvidence) -> PlaceBeliefs:
+        """The most probable pose at each place."""
+        log_odds = evidence.of_rotations() @ self.weights.rotation
+        log_odds += (evidence.of_bodies() @ self.weights.body)[:, None]
+        place = evidence.candidates.place
+        tolerance = DETECTION_FRACTION * self.ambiguity.diameter
+        return decide(posterior(log_odds, place), place, self.ambiguity.rotation_errors, tolerance)
+
+    def poses(self, evidence: SceneEvidence, beliefs: PlaceBeliefs) -> np.ndarray:
+        """(n, 4, 4) ``T_world_object`` of the beliefs, refined as whole objects, metres."""
+        rotation = self.ambiguity.mean_rotation(beliefs.weight)
+        T = evidence.candidates.T_world_object[beliefs.candidate] @ rotation
+        return self._whole.refine(T, [(view.measured, view.memo) for view in self._sorted_views()])
+
+    def describe(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> JointObjects:
+        """The objects of all views so far with what is known of them; arguments as for :meth:`objects`."""
+        order = self._order()
+        if not len(order):
+            return JointObjects(SceneObjects.empty(), np.zeros((0, len(self.weights.probability))))
+        evidence = self.evidence()
+        beliefs = self.believe(evidence)
+        T = self.poses(evidence, beliefs)
+        known, ambiguity = self._known, self.ambiguity
+        table, stamps, hypotheses = known.table[order], known.stamp[order], known.T_world_object[order]
+        members = self._members(T, hypotheses)
+        description = describe_objects(evidence, beliefs, members, table[:, 1], stamps)
+        probability = object_probability(description, self.weights.probability)
+        first = np.argsort(-probability, kind="stable")
+        apart_enough = self.parameters.exclusion * ambiguity.diameter
+        kept = first[suppress_neighbours(T[first, :3, 3][None], np.ones((1, len(first)), bool), apart_enough)[0]]
+        box, depth = project_features(ambiguity.views, invert(T_world_camera) @ T[kept], camera)
+        columns = []
+        distances = known.distances.take(order, axis=0).take(order, axis=1)
+        for row, own in enumerate(members[kept]):
+            mine = np.flatnonzero(own)
+            now = mine[stamps[mine] == stamp]
+            if len(now):
+                box[row], depth[row] = table[now[0], 2:6], table[now[0], 6]
+            columns.append((*table[mine[0], :2], len(np.unique(stamps[mine])), distances[np.ix_(mine, mine)].max()))
+        verification, score, support, spread = np.array(columns).T
+        objects = SceneObjects(
+            T[kept],
+            verification,
+            score,
+            box,
+            depth,
+            support.astype(int),
+            spread,
+            probability[kept],
+            beliefs.entropy[kept],
+        )
+        return JointObjects(objects, description[kept])
+
+    def _members(self, T_world_object: np.ndarray, hypotheses: np.ndarray) -> np.ndarray:
+        """(n, h) bool, which of (h, 4, 4) hypotheses stand for each of (n, 4, 4) objects: those of its body.
+
+        A twin that no hypothesis is of has the hypothesis with the nearest middle.
+        """
+        ambiguity = self.ambiguity
+        cut = self.parameters.cut * ambiguity.diameter
+        members = ambiguity.body_distance.between(T_world_object, hypotheses) < cut
+        alone = np.flatnonzero(~members.any(axis=1))
+        middles, others = (
+            transform_points(T, ambiguity.middle[None])[:, 0] for T in (T_world_object[alone], hypotheses)
+        )
+        members[alone, np.linalg.norm(middles[:, None] - others, axis=-1).argmin(axis=1)] = True
+        return members
+
+    def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
+        """The objects of all views so far, most probable first; arguments and features as for
+        :meth:`.SceneFusion.objects`."""
+        return self.describe(stamp, T_world_camera, camera).objects

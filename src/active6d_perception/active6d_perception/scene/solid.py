@@ -1,0 +1,70 @@
+"""The solid part of an object as a grid of signed distances, to find overlaps and points on its surface."""
+
+from typing import NamedTuple
+
+import numpy as np
+import open3d as o3d
+
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import invert, transform_points
+from active6d_perception.compiled import compiled
+from active6d_perception.model.model_views import ray_caster
+
+_CELL = 1 / 64  # diameters
+_MARGIN = 4  # cells around the object
+
+
+class Solid(NamedTuple):
+    """Signed distances at the corners of the cells of a grid."""
+
+    low: np.ndarray
+    """(3,) first corner, object frame, metres"""
+    cell: float
+    """edge of a cell, metres"""
+    distance: np.ndarray
+    """(nx, ny, nz) float32 metres, negative inside"""
+    reach: float
+    """no point farther than this from the object's origin is in the grid, metres"""
+
+
+def solid_of(model: ObjectModel, rotations: np.ndarray) -> Solid:
+    """What is solid however the object is rotated.
+
+    A neighbour whose rotation is not known excludes only this part: the body of a mug, without its handle.
+
+    Args:
+        model: the object.
+        rotations: (r, 4, 4) ``T_object_rotated``; the solid is common to all of them.
+    """
+    cell = _CELL * model.diameter
+    low, high = model.mesh.bounds
+    shape = np.ceil((high - low) / cell).astype(int) + 1 + 2 * _MARGIN
+    low = low - _MARGIN * cell
+    corners = low + cell * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    scene = ray_caster(model.mesh, 1)
+    distance = np.full(len(corners), -np.inf, np.float32)
+    for T in invert(rotations):
+        rotated = o3d.core.Tensor(transform_points(T, corners).astype(np.float32))
+        distance = np.maximum(distance, scene.compute_signed_distance(rotated).numpy())
+    reach = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(corners[-1]))))
+    return Solid(low, cell, distance.reshape(shape), reach)
+
+
+@compiled
+def signed_distance(x: float, y: float, z: float, solid: Solid) -> float:
+    """Signed distance of a point in the object frame, metres; ``inf`` outside of the grid."""
+    i, j, k = (x - solid.low[0]) / solid.cell, (y - solid.low[1]) / solid.cell, (z - solid.low[2]) / solid.cell
+    nx, ny, nz = solid.distance.shape
+    if not (0 <= i < nx - 1 and 0 <= j < ny - 1 and 0 <= k < nz - 1):
+        return np.inf
+    a, b, c = int(i), int(j), int(k)
+    u, v, w = i - a, j - b, k - c
+    d = solid.distance
+    near = (d[a, b, c] * (1 - w) + d[a, b, c + 1] * w) * (1 - v) + (
+        d[a, b + 1, c] * (1 - w) + d[a, b + 1, c + 1] * w
+    ) * v
+    a += 1
+    far = (d[a, b, c] * (1 - w) + d[a, b, c + 1] * w) * (1 - v) + (
+        d[a, b + 1, c] * (1 - w) + d[a, b + 1, c + 1] * w
+    ) * v
+    return near * (1 - u) + far * u

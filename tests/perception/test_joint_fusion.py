@@ -1,0 +1,174 @@
+"""Fusion from all views on rendered mugs: what one view guesses wrong, the others correct."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from active6d_core.camera import PinholeCamera
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.metrics import e_add
+from active6d_core.object_model import load_object
+from active6d_core.se3 import invert, make_transform
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.scene.ambiguity import ambiguity_of
+from active6d_perception.scene.belief_weights import BeliefWeights
+from active6d_perception.scene.expected_visibility import OPEN_TABLE
+from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.measured_cases import CASES, FITTING, LOOKED_THROUGH, WHAT, WHOSE
+from active6d_perception.scene.object_probability import OBJECT_COLUMNS
+from active6d_perception.scene.scene_evidence import BODY_COLUMNS, ROTATION_COLUMNS
+
+SPHERE = ViewSphere()
+CAMERA = PinholeCamera(320, 240, 277.0, 277.0, 159.5, 119.5)
+#: Two mugs on their sides, 16 cm apart.
+TRUE = make_transform(
+    Rotation.from_euler("xyz", [[90, 0, 40], [90, 30, 200]], degrees=True).as_matrix(),
+    [[-0.08, 0.0, 0.045], [0.08, 0.02, 0.045]],
+)
+VIEWS = (30, 37, 44, 51)
+
+
+def hand_set_weights() -> BeliefWeights:
+    """What fits speaks for a pose, what the camera looked through against it, and overlap too."""
+    case = np.zeros((WHAT, WHOSE))
+    case[FITTING], case[LOOKED_THROUGH] = 2.0, -2.0
+    rotation, body, probability = (np.zeros(len(each)) for each in (ROTATION_COLUMNS, BODY_COLUMNS, OBJECT_COLUMNS))
+    rotation[:CASES] = body[:CASES] = case.ravel()
+    rotation[ROTATION_COLUMNS.index("share in neighbours")] = -3.0
+    rotation[ROTATION_COLUMNS.index("share below the floor")] = -3.0
+    probability[OBJECT_COLUMNS.index("log-odds of the pose")] = 1.0
+    return BeliefWeights(rotation, body, probability)
+
+
+@pytest.fixture(scope="module")
+def mug():
+    return load_object("mug")
+
+
+@pytest.fixture(scope="module")
+def episode(mug, render):
+    """Views of the two mugs. Each view has hypotheses with right bodies; only the third has right handles."""
+    rng, ambiguity, seen = np.random.default_rng(0), ambiguity_of(mug), []
+    for number, index in enumerate(VIEWS):
+        T_world_camera = SPHERE.pose(SPHERE.positions[index])
+        T_camera_world = invert(T_world_camera)
+        depth, _ = render(mug, T_camera_world @ TRUE, CAMERA)
+        single = [render(mug, (T_camera_world @ T)[None], CAMERA)[0] for T in TRUE]
+        segmentation = np.zeros(depth.shape, np.uint16)
+        for label, own in enumerate(single, 1):
+            segmentation[np.abs(own - depth) < 1e-6] = label
+        # A floor below the mugs, along the ray of each pixel.
+        floor = _floor_depth(T_world_camera)
+        depth = np.where(np.isfinite(depth), depth, floor).astype(np.float32)
+        wrong = ambiguity.rotations[rng.choice([9, 14, 20, 27], 2)] if number != 2 else np.eye(4)
+        noise = make_transform(
+            Rotation.from_rotvec(rng.normal(0, 0.01, (2, 3))).as_matrix(), rng.normal(0, 1e-3, (2, 3))
+        )
+        T = T_camera_world @ TRUE @ wrong @ noise
+        hypotheses = Hypotheses.from_masks(T, rng.uniform(0.5, 0.9, 2), np.array([1, 2]), segmentation, depth)
+        seen.append((1_000 * (number + 1), T_world_camera, hypotheses, np.full(2, 0.8), depth, CAMERA))
+    return seen
+
+
+def _floor_depth(T_world_camera: np.ndarray) -> np.ndarray:
+    """(240, 320) depth of the plane z = 0 in the world."""
+    v, u = np.mgrid[0:240, 0:320]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u, float)], axis=-1)
+    return -T_world_camera[2, 3] / (rays @ T_world_camera[2, :3])
+
+
+def fuse(mug, views, weights=None) -> JointFusion:
+    fusion = JointFusion(mug, weights=weights or hand_set_weights(), tray=OPEN_TABLE)
+    for view in views:
+        fusion.add_view(*view)
+    return fusion
+
+
+def objects_of(fusion, view):
+    return fusion.objects(view[0], view[1], view[-1])
+
+
+def test_all_views_together_know_the_handles(mug, episode):
+    objects = objects_of(fuse(mug, episode), episode[-1])
+    errors = e_add(mug, objects.T_world_object[:, None], TRUE).min(axis=0)
+    assert len(objects) == 2
+    assert errors.max() < 1e-3
+    assert objects.probability.min() > 0.9
+    np.testing.assert_array_equal(objects.support, [4, 4])
+
+
+def test_no_hypothesis_needs_to_have_the_right_handle(mug, episode):
+    guessed = [view for view in episode if view is not episode[2]]
+    before = np.concatenate([T_world_camera @ h.T_camera_object for _, T_world_camera, h, *_ in guessed])
+    assert e_add(mug, before[:, None], TRUE).min() > 0.03
+    objects = objects_of(fuse(mug, guessed), guessed[-1])
+    assert e_add(mug, objects.T_world_object[:, None], TRUE).min(axis=0).max() < 2e-3
+
+
+def test_the_order_of_views_changes_nothing(mug, episode):
+    expected = objects_of(fuse(mug, episode), episode[-1])
+    shuffled = fuse(mug, [])
+    for place in (2, 0, 3, 1):
+        shuffled.add_view(*episode[place])
+        objects_of(shuffled, episode[-1])  # what is remembered between views must not matter either
+    found = objects_of(shuffled, episode[-1])
+    for name, value in vars(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
+
+
+def test_a_view_counts_once_and_can_be_forgotten(mug, episode):
+    fusion = fuse(mug, episode[:2])
+    expected = objects_of(fusion, episode[1])
+    assert not fusion.add_view(*episode[0])
+    again = objects_of(fusion, episode[1])
+    np.testing.assert_array_equal(again.T_world_object, expected.T_world_object)
+    assert fusion.add_view(*episode[2])
+    fusion.forget_before(episode[2][0])
+    alone = objects_of(fuse(mug, episode[2:3]), episode[2])
+    left = objects_of(fusion, episode[2])
+    np.testing.assert_array_equal(left.T_world_object, alone.T_world_object)
+    fusion.reset()
+    assert len(objects_of(fusion, episode[0])) == 0
+
+
+def test_nothing_seen_is_nothing_found(mug, episode):
+    stamp, T_world_camera, hypotheses, _, depth, camera = episode[0]
+    fusion = fuse(mug, [])
+    empty = Hypotheses.empty(*hypotheses.segmentation.shape)
+    fusion.add_view(stamp, T_world_camera, empty, np.zeros(0), depth, camera)
+    assert len(fusion.objects(stamp, T_world_camera, camera)) == 0
+
+
+def test_another_view_computes_its_own_part_only(mug, episode, monkeypatch):
+    from active6d_perception.scene import joint_fusion
+
+    fusion = fuse(mug, episode[:3])
+    objects_of(fusion, episode[2])
+    counted, count_cases = [], joint_fusion.count_cases
+
+    def count(T, *rest):
+        counted.append((len(T), rest[-1]))
+        return count_cases(T, *rest)
+
+    monkeypatch.setattr(joint_fusion, "count_cases", count)
+    objects_of(fusion, episode[2])
+    assert counted == []
+    fusion.add_view(*episode[3])
+    objects_of(fusion, episode[3])
+    newest = fusion.views[episode[3][0]]
+    of_newest = sum(poses for poses, view in counted if view is newest)
+    # Poses that the new view moves are looked at again in the others.
+    assert of_newest >= sum(poses for poses, _ in counted) / 4 > 0
+
+
+def test_the_current_view_gives_boxes_where_it_has_hypotheses(mug, episode):
+    stamp, T_world_camera, hypotheses, *_ = episode[1]
+    fusion = fuse(mug, episode)
+    objects = fusion.objects(stamp, T_world_camera, CAMERA)
+    for box, depth in zip(objects.box, objects.depth, strict=True):
+        own = np.abs(hypotheses.box - box).sum(axis=1).argmin()
+        np.testing.assert_array_equal(box, hypotheses.box[own])
+        assert depth == hypotheses.depth[own]
+    beside = fusion.objects(77, T_world_camera, CAMERA)
+    assert np.abs(beside.box - objects.box).max() > 1e-4
+    np.testing.assert_allclose(beside.box, objects.box, atol=0.02)
