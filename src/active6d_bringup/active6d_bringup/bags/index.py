@@ -2,24 +2,34 @@
 
 import json
 import zlib
-from collections import defaultdict
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import yaml
 from rosbags.rosbag2 import Reader
 
+from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.mcap_file import McapFile, RecordedMessage
+from active6d_bringup.bags.recorded_camera import import_camera
+from active6d_bringup.bags.source import BagError
 from active6d_bringup.bags.writer import ACTIVE6D, CHECKSUM, INFORMATION, SETTINGS, TYPESTORE, file_number, stamp_of
-from active6d_core.ros.topics import CAMERA_POSE, CONTRACT, DIAGNOSTICS, TOPICS
+from active6d_core.calibration import Calibration
+from active6d_core.ros.conversions import COLOR_ENCODINGS
+from active6d_core.ros.topics import (
+    CAMERA_COLOR,
+    CAMERA_DEPTH,
+    CAMERA_INFO,
+    CAMERA_POSE,
+    CAMERA_TOPICS,
+    CONTRACT,
+    DIAGNOSTICS,
+    TOPICS,
+)
 
 _POSE_ENDING = f"/{CAMERA_POSE.name}"
 _ENDINGS = tuple("/" + topic.name.lstrip("/") for topic in CONTRACT)
-
-
-class BagError(ValueError):
-    """A bag that cannot be read as an episode; the text names the folder and says what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +43,9 @@ class BagIndex:
         diagnostics: every serialized message of ``/diagnostics``, in order.
         settings: node name to its parameters when recording; empty where the bag does not have them.
         damage: what is missing or damaged, in words; empty for a whole bag.
+        left_out: reason to the number of views that are not in it.
+        notes: what is doubtful, in words.
+        source: topics of another program's camera from which the camera's were made, empty for a bag of this project.
     """
 
     folder: Path
@@ -41,6 +54,18 @@ class BagIndex:
     diagnostics: list[bytes]
     settings: dict[str, dict[str, Any]]
     damage: tuple[str, ...] = ()
+    left_out: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    source: str = ""
+
+    @property
+    def frames(self) -> dict[str, str]:
+        """The nodes' parameters ``world_frame`` and ``camera_frame`` for the frames of the recording."""
+        found = {}
+        for name, topic in (("world_frame", CAMERA_POSE), ("camera_frame", CAMERA_COLOR)):
+            first: Any = TYPESTORE.deserialize_cdr(next(iter(self.payloads[topic.name].values())), topic.type)
+            found[name] = first.header.frame_id
+        return found
 
     def messages(self, topic: str) -> dict[int, Any]:
         """Stamp (ns) to deserialized message of one topic.
@@ -58,14 +83,33 @@ class BagIndex:
             raise BagError(f"{self.folder}: damaged message of {topic} ({error})") from error
 
 
-def read_bag(folder: Path) -> BagIndex:
-    """Read a bag in one pass. Of a killed, cut or damaged one, the whole chunks are read.
+def read_bag(path: Path, options: CameraOptions = CameraOptions()) -> BagIndex:
+    """Read a bag of this project, or the camera of any other recording.
+
+    Of a killed, cut or damaged bag of this project, the whole chunks are read.
+
+    Args:
+        path: folder of a bag, or a file of rosbag2 (MCAP, sqlite3) or of ROS 1.
+        options: what the user says of the camera; without, a bag of this project is read as it is.
 
     Raises:
-        BagError: no bag, or one that is no episode.
+        BagError: no bag, or one without a usable view.
     """
-    if not folder.is_dir():
-        raise BagError(f"{folder}: no such folder; name the folder of a bag, the one with metadata.yaml in it")
+    index, damage = None, ()
+    if not options.given and ((path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))):
+        index, damage = _read_own(path)
+    if index is not None:
+        return index
+    try:
+        camera = import_camera(path, options)
+    except BagError as error:
+        raise BagError("; ".join([str(error), *damage])) from error
+    made = camera.payloads, camera.received
+    return BagIndex(path, *made, [], {}, damage, camera.left_out, camera.notes, str(camera.topics))
+
+
+def _read_own(folder: Path) -> tuple[BagIndex | None, tuple[str, ...]]:
+    """The bag's topics of the contract, None where its camera is not what the graph publishes; and the damage."""
     metadata, damage = _read_metadata(folder)
     if metadata.get("storage_identifier", "mcap") == "mcap" and not metadata.get("compression_mode"):
         messages, recorded, settings, lines = _read_mcap(folder, metadata)
@@ -75,13 +119,13 @@ def read_bag(folder: Path) -> BagIndex:
         recorded = {(message.topic, message.type) for message in messages}
     if settings is None:
         settings = (metadata.get("custom_data") or {}).get(SETTINGS)
-    try:
-        names = topic_names(recorded, folder)
-    except BagError as error:
-        raise BagError("; ".join([str(error), *damage])) from error
+    names = topic_names(recorded, folder)
+    if names is None:
+        return None, tuple(damage)
     payloads: dict[str, dict[int, bytes]] = defaultdict(dict)
     received: dict[str, dict[int, int]] = defaultdict(dict)
     diagnostics: list[bytes] = []
+    repeated = False
     for message in messages:
         topic = names.get(message.topic)
         if topic is None:
@@ -90,9 +134,50 @@ def read_bag(folder: Path) -> BagIndex:
             diagnostics.append(message.payload)
             continue
         stamp = stamp_of(message.type, message.payload)
+        repeated |= TOPICS[topic] in CAMERA_TOPICS and stamp in payloads[topic]
         payloads[topic][stamp] = message.payload
         received[topic][stamp] = message.received
-    return BagIndex(folder, dict(payloads), dict(received), diagnostics, _parse_settings(settings), tuple(damage))
+    recording = dict(payloads), dict(received), diagnostics, _parse_settings(settings)
+    index = BagIndex(folder, *recording, tuple(damage), _incomplete(payloads))
+    usable = bool(damage) or (not repeated and _is_of_the_contract(index))
+    return index if usable else None, tuple(damage)
+
+
+def _incomplete(payloads: dict[str, dict[int, bytes]]) -> dict[str, int]:
+    """Reason to number of views that lack a topic of the camera."""
+    stamps = {topic.name: payloads.get(topic.name, {}).keys() for topic in CAMERA_TOPICS}
+    lacking = [
+        ", ".join(name for name, known in stamps.items() if stamp not in known)
+        for stamp in set().union(*stamps.values())
+        if not all(stamp in known for known in stamps.values())
+    ]
+    return {f"no message of {names} for it": count for names, count in Counter(lacking).items()}
+
+
+def _is_of_the_contract(index: BagIndex) -> bool:
+    """Whether the camera's messages can be used as they are; else they are read as those of a foreign recording."""
+    stamps = [list(index.payloads.get(topic.name, {})) for topic in CAMERA_TOPICS]
+    complete = set.intersection(*map(set, stamps))
+    # A recording may begin or end within a view, and no further.
+    if not complete or min(complete) <= 0 or any(each != sorted(each) for each in stamps):
+        return False
+    incomplete = set().union(*stamps) - complete
+    before, after = (sum(at(stamp) for stamp in incomplete) for at in (min(complete).__gt__, max(complete).__lt__))
+    if before > 1 or after > 1 or before + after < len(incomplete):
+        return False
+    camera = [index.messages(topic.name) for topic in (CAMERA_COLOR, CAMERA_DEPTH, CAMERA_INFO)]
+    for stamp in complete:
+        color, depth, info = (messages[stamp] for messages in camera)
+        try:
+            calibration = Calibration.from_info(info)
+        except ValueError:
+            return False
+        encodings = color.encoding in COLOR_ENCODINGS and depth.encoding in ("32FC1", "16UC1")
+        if calibration.distorted or not encodings or color.header.frame_id != depth.header.frame_id:
+            return False
+        if any((image.width, image.height) != calibration.image_size for image in (color, depth)):
+            return False
+    return True
 
 
 def _read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
@@ -151,17 +236,22 @@ def _read_with_rosbags(folder: Path) -> list[RecordedMessage]:
         raise BagError(f"{folder}: damaged bag ({error})") from error
 
 
-def topic_names(recorded: set[tuple[str, str]], folder: Path) -> dict[str, str]:
+def topic_names(recorded: set[tuple[str, str]], folder: Path) -> dict[str, str] | None:
     """Recorded topic to its name in the contract, for the topics of the contract, whatever their namespace.
 
+    None where the camera's topics are not there, or are of other types.
+
     Raises:
-        BagError: the bag has no camera pose, or several (more than one namespace).
+        BagError: the bag has several camera poses (more than one namespace).
     """
     poses = sorted({topic for topic, _ in recorded if topic.endswith(_POSE_ENDING)})
-    if len(poses) != 1:
-        found = f"several namespaces ({', '.join(poses)})" if poses else f"no topic {CAMERA_POSE.name}"
-        raise BagError(f"{folder}: has {found}; it is not an episode of active6d")
+    if len(poses) > 1:
+        raise BagError(f"{folder}: has several namespaces ({', '.join(poses)}); choose topics with --topics")
+    if not poses:
+        return None
     prefix = poses[0].removesuffix(CAMERA_POSE.name)
+    if not {(prefix + topic.name, topic.type) for topic in CAMERA_TOPICS} <= recorded:
+        return None
     known = {topic.name if topic.name.startswith("/") else prefix + topic.name: topic for topic in CONTRACT}
     for topic, message_type in sorted(recorded):
         if topic in known and message_type != known[topic].type:

@@ -10,8 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from active6d_bringup.bags.index import BagError, BagIndex, read_bag
+from active6d_bringup.bags.camera_topics import CameraOptions
+from active6d_bringup.bags.index import BagIndex, read_bag
+from active6d_bringup.bags.source import BagError
 from active6d_bringup.bags.writer import TYPESTORE
+from active6d_bringup.camera.preflight import check_depth_unit
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.ros.conversions import (
@@ -119,13 +122,13 @@ class EpisodeRecord:
         return np.array([step.view.T_world_camera[:3, 3] for step in self.steps]).reshape(-1, 3)
 
 
-def read_episodes(bag: Path | str | BagIndex) -> list[EpisodeRecord]:
+def read_episodes(bag: Path | str | BagIndex, options: CameraOptions = CameraOptions()) -> list[EpisodeRecord]:
     """Every episode of a bag or of its index, in order; a bag without ``episode/start`` is one episode.
 
     Raises:
         BagError: no bag, a broken one, or one without a complete view.
     """
-    index = bag if isinstance(bag, BagIndex) else read_bag(Path(bag))
+    index = bag if isinstance(bag, BagIndex) else read_bag(Path(bag), options)
     try:
         messages, latencies = _read_messages(index)
         return _episodes(index, messages, latencies)
@@ -199,6 +202,9 @@ def _step(messages: dict[str, dict[int, Any]], latency_ms: dict[str, float], sta
         camera=info_to_camera(at["camera/color/camera_info"]),
         T_world_camera=pose_stamped_to_transform(at[CAMERA_POSE.name], world),
     )
+    problem = check_depth_unit(view.depth, float(np.linalg.norm(view.T_world_camera[:3, 3])))
+    if problem:
+        raise MessageError(f"view of {stamp * 1e-9:.3f} s: {problem}")
     hypotheses = objects = unexplained = attention = attended = goal = None
     if "hypotheses" in at and "hypotheses/segmentation" in at:
         segmentation = image_to_segmentation(at["hypotheses/segmentation"])

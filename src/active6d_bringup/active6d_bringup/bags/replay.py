@@ -11,8 +11,10 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from active6d_bringup.bags.index import BagError, read_bag
+from active6d_bringup.bags.camera_topics import CameraOptions
+from active6d_bringup.bags.index import read_bag
 from active6d_bringup.bags.reader import read_episodes
+from active6d_bringup.bags.source import BagError
 from active6d_bringup.bags.writer import TYPESTORE, stamp_of
 from active6d_bringup.graph.composition import GraphDescription, OnEvent, default_params_file, running
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
@@ -35,6 +37,7 @@ class ReplaySettings:
         processes: every node in a process of its own.
         params_file: ROS parameters; None takes those of this package.
         overrides: node name to parameters; they win over the file and over what was recorded.
+        camera: what the user says of the camera of a foreign recording.
         domain: ROS domain, see ``GraphDescription``.
         patience: seconds without an answer after which the replay counts as stuck.
     """
@@ -46,6 +49,7 @@ class ReplaySettings:
     processes: bool = False
     params_file: Path | None = None
     overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
+    camera: CameraOptions = CameraOptions()
     domain: int | None = None
     patience: float = 120.0
 
@@ -80,11 +84,15 @@ class ReplayResult:
         views: number of views replayed.
         comparisons: one per view and topic of ``COMPARED``.
         seconds: of wall-clock time from the first view to the last objects.
+        left_out: reason to the number of views that were not replayed.
+        notes: what is doubtful in the recording, in words.
     """
 
     views: int
     comparisons: list[Comparison]
     seconds: float
+    left_out: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     @property
     def equal(self) -> bool:
@@ -119,12 +127,12 @@ def replay(
         EpisodeError: perception does not answer.
         EpisodeInterrupted: by Ctrl-C or SIGTERM.
     """
-    index = read_bag(settings.bag)
+    index = read_bag(settings.bag, settings.camera)
     for line in index.damage:
         on_event(f"{settings.bag}: {line}")
     episodes = read_episodes(index)
     stamps = [step.stamp for episode in episodes for step in episode.steps]
-    description = describe(settings, episodes[0].object, index.settings)
+    description = describe(settings, episodes[0].object, index.settings, index.frames)
     with interruptible() as interrupted, running(make_graph(settings, description, on_event)) as graph:
         listener = _Listener(graph.context)
         graph.add(listener)
@@ -147,11 +155,14 @@ def replay(
         for stamp in stamps
         for topic in COMPARED
     ]
-    return ReplayResult(len(stamps), comparisons, seconds)
+    return ReplayResult(len(stamps), comparisons, seconds, index.left_out, index.notes)
 
 
 def describe(
-    settings: ReplaySettings, recorded_object: str | None, recorded: dict[str, dict[str, Any]]
+    settings: ReplaySettings,
+    recorded_object: str | None,
+    recorded: dict[str, dict[str, Any]],
+    frames: dict[str, str],
 ) -> GraphDescription:
     """The graph of a replay: a player in the camera's place, and perception with its recorded parameters.
 
@@ -165,11 +176,11 @@ def describe(
     if settings.estimator is not None:
         estimator["estimator"] = settings.estimator
     nodes = {
-        "bag_player": {"bag": str(settings.bag), "rate": float(settings.rate)},
+        "bag_player": {"bag": str(settings.bag), "rate": float(settings.rate), **settings.camera.parameters},
         "pose_estimator": estimator,
         "hypothesis_fusion": {**recorded.get("hypothesis_fusion", {}), "object": name},
     }
-    nodes = {name: {**parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
+    nodes = {name: {**frames, **parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
     return GraphDescription(nodes, settings.params_file or default_params_file(), domain=settings.domain)
 
 

@@ -46,8 +46,10 @@ def check_sizes(calibration: Calibration, color: np.ndarray) -> str:
 
 
 def check_matrices(calibration: Calibration, rectified: bool) -> str:
-    """Whether K and P of camera_info agree on undistorted images; empty if so."""
-    if rectified or calibration.distorted or not calibration.matrices_differ:
+    """Whether camera_info leaves no doubt that images are raw, or rectified; empty if so."""
+    if not rectified and calibration.distorted:
+        return "camera_info has distortion, so images are rectified here: if they are already, say so (rectified)"
+    if rectified or not calibration.matrices_differ:
         return ""
     focal = f"fx {calibration.K[0, 0]:.1f} and {calibration.P[0, 0]:.1f}"
     return f"K and P of camera_info differ ({focal}) without distortion: P is used, as for rectified images"

@@ -56,10 +56,14 @@ class FrameMatcher:
 
 
 class PoseHistory:
-    """The camera's poses of the last seconds."""
+    """The camera's poses of the last seconds.
 
-    def __init__(self) -> None:
-        self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=_KEPT_POSES)
+    Args:
+        keep: how many, None for all.
+    """
+
+    def __init__(self, keep: int | None = _KEPT_POSES) -> None:
+        self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=keep)
 
     def add(self, stamp: int, T_world_camera: np.ndarray) -> None:
         """Take (4, 4) ``T_world_camera`` at a stamp (ns); a clock that goes back begins a new history."""

@@ -8,7 +8,9 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
-from active6d_bringup.bags.index import BagError, read_bag
+from active6d_bringup.bags.camera_topics import CameraOptions
+from active6d_bringup.bags.index import read_bag
+from active6d_bringup.bags.source import BagError
 from active6d_core.ros import topics
 from active6d_core.ros.clock_output import ClockOutput
 from active6d_core.ros.conversions import stamp_to_ns
@@ -34,6 +36,9 @@ class BagPlayerNode(GraphNode):
             "speed relative to the recording; 0: the next view follows when the objects of the last one have arrived",
             minimum=0.0,
         )
+        self.declare("topics", "", "topics of a foreign recording, such as color=/left/image,depth=/left/depth")
+        self.declare("depth_scale", 0.0, "metres per unit of its depth, 0: as REP-118 says", minimum=0.0)
+        self.declare("rectified", False, "its images are rectified, whatever camera_info says")
         self._clock_output = ClockOutput(self)
         self._outputs = {}
         for topic in topics.REPLAYED_TOPICS:
@@ -53,7 +58,8 @@ class BagPlayerNode(GraphNode):
         folder, self._rate = self.value("bag"), self.value("rate")
         if not folder:
             raise ValueError("bag_player: parameter 'bag' must name the folder of a bag")
-        self._views, self._received = _read_views(Path(folder).expanduser())
+        options = CameraOptions.parse(self.value("topics"), self.value("depth_scale"), self.value("rectified"))
+        self._views, self._received = _read_views(Path(folder).expanduser(), options)
         self._stamps = sorted(self._views)
         self._next = 0
 
@@ -105,9 +111,9 @@ class BagPlayerNode(GraphNode):
             self._timer = timer(max(pause, 0.0), self._publish_next)
 
 
-def _read_views(folder: Path) -> tuple[dict[int, dict[str, bytes]], dict[int, int]]:
+def _read_views(folder: Path, options: CameraOptions) -> tuple[dict[int, dict[str, bytes]], dict[int, int]]:
     """Per complete view's stamp: its serialized messages by topic, and when (ns) its pose was recorded."""
-    index = read_bag(folder)
+    index = read_bag(folder, options)
     views: dict[int, dict[str, bytes]] = defaultdict(dict)
     for topic in topics.REPLAYED_TOPICS:
         for stamp, payload in index.payloads.get(topic.name, {}).items():

@@ -58,7 +58,8 @@ _DTYPES = {
 _DATATYPES = {dtype: datatype for datatype, dtype in _DTYPES.items()}
 #: Distortion models that with d = 0 leave an image as it is.
 _WITHOUT_DISTORTION = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "inverse_brown_conrady")
-_COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
+#: Encodings of colour images that the graph uses, with the places of red, green and blue.
+COLOR_ENCODINGS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
 #: A quaternion whose norm is further from one than this was not meant as a rotation.
 _QUATERNION_TOLERANCE = 1e-2
 
@@ -200,9 +201,9 @@ def image_to_color(message: Image) -> np.ndarray:
     Raises:
         MessageError: another encoding, or sizes that disagree.
     """
-    channels = _COLOR_CHANNELS.get(message.encoding)
+    channels = COLOR_ENCODINGS.get(message.encoding)
     if channels is None:
-        raise MessageError(f"color encoding '{message.encoding}' is not one of {', '.join(_COLOR_CHANNELS)}")
+        raise MessageError(f"color encoding '{message.encoding}' is not one of {', '.join(COLOR_ENCODINGS)}")
     pixels = image_to_pixels(message, np.dtype("u1"), 4 if message.encoding.endswith("a8") else 3)
     return pixels if message.encoding == "rgb8" else np.ascontiguousarray(pixels[..., channels])
 

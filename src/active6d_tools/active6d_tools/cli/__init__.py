@@ -10,6 +10,7 @@ from typer.exceptions import TyperException
 
 from active6d_tools.cli import (
     ablate,
+    bags,
     bank,
     benchmark,
     benchmark_agent,
@@ -103,6 +104,7 @@ app.command(cls=PartsCommand)(bank.bank)
 app.command(cls=PartsCommand)(evaluate.evaluate)
 app.command(cls=PartsCommand)(ablate.ablate)
 app.command("list")(list_parts.list_parts)
+app.add_typer(bags.app, name="bag")
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
 benchmark.app.command()(benchmark_estimator.estimator)

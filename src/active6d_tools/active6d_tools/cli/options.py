@@ -13,7 +13,23 @@ if TYPE_CHECKING:
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results to this JSON file.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random generators.", min=0)]
 ObjectName = Annotated[str, typer.Option("--object", help="Name of the object, see `active6d object list`.")]
-BagFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a recorded bag.")]
+BagFolder = Annotated[
+    Path, typer.Argument(metavar="BAG", help="Folder of a recorded bag, or a file: .mcap, .db3 or .bag (ROS 1).")
+]
+BagTopics = Annotated[
+    str,
+    typer.Option(
+        "--topics",
+        metavar="KEY=NAME,...",
+        help="Topics of another program's camera: color, depth, info, depth_info, pose; and the frame world.",
+    ),
+]
+BagDepthScale = Annotated[
+    float, typer.Option("--depth-scale", min=0.0, help="Metres per unit of its depth; by default as REP-118 says.")
+]
+BagRectified = Annotated[
+    bool, typer.Option("--rectified", help="Its images are rectified, whatever camera_info says of distortion.")
+]
 BagObject = Annotated[str | None, typer.Option("--object", help="Name of the object, if the bag does not contain it.")]
 Processes = Annotated[bool, typer.Option("--processes", help="Run every node in its own process.")]
 ParamsFile = Annotated[Path | None, typer.Option(metavar="FILE", help="YAML file with ROS parameters of the nodes.")]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from active6d_core.files import atomic_file, write_file
-from active6d_tools.cli.terminal import messages
+from active6d_tools.cli.terminal import console, messages
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,3 +82,11 @@ def write_reports(
             with messages.status(f"drawing {path.name}"):
                 write_file(path, render(analysis))
             messages.print(f"wrote {path}", highlight=False, markup=False)
+
+
+def print_left_out(left_out: dict[str, int], notes: list[str]) -> None:
+    """Print how many views of a recording are not used, for which reason, and what is doubtful."""
+    for reason, count in sorted(left_out.items(), key=lambda item: -item[1]):
+        console.print(f"left out {count}: {reason}", highlight=False, markup=False)
+    for note in notes:
+        console.print(f"note: {note}", highlight=False, markup=False)

@@ -5,8 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from active6d_tools.cli.options import (
+    BagDepthScale,
     BagFolder,
     BagObject,
+    BagRectified,
+    BagTopics,
     Imports,
     JsonFile,
     NodeParameters,
@@ -14,7 +17,7 @@ from active6d_tools.cli.options import (
     Processes,
     parse_overrides,
 )
-from active6d_tools.cli.output import write_json
+from active6d_tools.cli.output import print_left_out, write_json
 from active6d_tools.cli.terminal import console, progress_bar
 
 if TYPE_CHECKING:
@@ -31,6 +34,9 @@ def replay(
         bool, typer.Option("--compare", help="Exit with code 1 unless hypotheses and objects equal the recorded ones.")
     ] = False,
     object_name: BagObject = None,
+    topics: BagTopics = "",
+    depth_scale: BagDepthScale = 0.0,
+    rectified: BagRectified = False,
     estimator: Annotated[
         str | None, typer.Option(help="Estimator to use instead of the recorded one: auto, {estimators}.")
     ] = None,
@@ -46,12 +52,14 @@ def replay(
     """
     if as_fast and rate != 1.0:
         raise ValueError("--rate and --as-fast exclude each other")
+    from active6d_bringup.bags.camera_topics import CameraOptions
     from active6d_bringup.bags.replay import ReplaySettings
 
     settings = ReplaySettings(
         bag=folder,
         rate=0.0 if as_fast else rate,
         object=object_name,
+        camera=CameraOptions.parse(topics, depth_scale, rectified),
         estimator=estimator,
         processes=processes,
         params_file=params_file,
@@ -59,6 +67,7 @@ def replay(
     )
     result = _run(settings)
     console.print(f"{result.views} views in {result.seconds:.1f} s", highlight=False)
+    print_left_out(result.left_out, result.notes)
     if compare:
         _print_comparison(result)
     write_json(json_file, _summary(result))
@@ -106,6 +115,8 @@ def _summary(result: "ReplayResult") -> dict:
         "views": result.views,
         "seconds": result.seconds,
         "equal": result.equal,
+        "left_out": result.left_out,
+        "notes": result.notes,
         "messages": [
             {
                 "stamp": comparison.stamp,

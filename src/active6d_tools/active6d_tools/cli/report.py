@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from active6d_tools.cli.options import BagFolder, BagObject, JsonFile
-from active6d_tools.cli.output import write_json, write_reports
+from active6d_tools.cli.options import BagDepthScale, BagFolder, BagObject, BagRectified, BagTopics, JsonFile
+from active6d_tools.cli.output import print_left_out, write_json, write_reports
 from active6d_tools.cli.terminal import console, messages
 
 if TYPE_CHECKING:
@@ -24,6 +24,9 @@ def report(
         typer.Option(metavar="FILE", help="Draw a figure of the episode as PNG: before, after, attention, path."),
     ] = None,
     object_name: BagObject = None,
+    topics: BagTopics = "",
+    depth_scale: BagDepthScale = 0.0,
+    rectified: BagRectified = False,
     episode: Annotated[int, typer.Option(min=0, help="Number of the episode in a bag with several, from 0.")] = 0,
     json_file: JsonFile = None,
 ) -> None:
@@ -31,18 +34,23 @@ def report(
 
     Example: [bold]active6d report bags/mug -o mug.html --figure mug.png[/bold]
     """
+    from active6d_bringup.bags.camera_topics import CameraOptions
+    from active6d_bringup.bags.index import read_bag
     from active6d_bringup.bags.reader import read_episodes
     from active6d_tools.report.analysis import analyse
 
     with messages.status("reading the bag"):
-        records = read_episodes(folder)
+        index = read_bag(folder, CameraOptions.parse(topics, depth_scale, rectified))
+        records = read_episodes(index)
         if episode >= len(records):
             raise ValueError(f"--episode {episode}: {folder} has {len(records)}, counted from 0")
         analysis = analyse(records[episode], object_name)
     for line in records[0].damage:
         typer.echo(f"{folder}: {line}", err=True)
-    write_reports(analysis, output or folder / "report.html", png, figure)
+    beside = folder / "report.html" if folder.is_dir() else folder.with_suffix(".html")
+    write_reports(analysis, output or beside, png, figure)
     print_summary(analysis)
+    print_left_out(index.left_out, index.notes)
     write_json(json_file, analysis.summary())
 
 

@@ -1,0 +1,194 @@
+"""Which topics of a recording are the camera: found by type, encoding and frame."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from active6d_bringup.bags.source import BagError, BagSource
+from active6d_core.calibration import Calibration
+from active6d_core.ros.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_INFO, CAMERA_POSE
+
+IMAGES = {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"}
+INFO = "sensor_msgs/msg/CameraInfo"
+POSES = {"geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"}
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+#: What a user may name with ``--topics``; world is a frame.
+KEYS = ("color", "depth", "info", "depth_info", "pose", "world")
+_DEPTH_ENCODINGS = {"16UC1", "mono16", "32FC1", "64FC1"}
+_NAMES = {"color": CAMERA_COLOR.name, "depth": CAMERA_DEPTH.name, "info": CAMERA_INFO.name, "pose": CAMERA_POSE.name}
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """What a user says of a recorded camera.
+
+    Attributes:
+        topics: names that replace what would be found, by the keys of ``KEYS``.
+        depth_scale: metres per unit of depth, 0 for what REP-118 says.
+        rectified: images are rectified already, whatever camera_info says.
+    """
+
+    topics: dict[str, str] = field(default_factory=dict)
+    depth_scale: float = 0.0
+    rectified: bool = False
+
+    @classmethod
+    def parse(cls, topics: str, depth_scale: float = 0.0, rectified: bool = False) -> "CameraOptions":
+        """From a text such as ``color=/left/image,depth=/left/depth``.
+
+        Raises:
+            ValueError: a part is not KEY=NAME, or the key is unknown.
+        """
+        named = {}
+        for part in filter(None, (part.strip() for part in topics.split(","))):
+            key, _, name = part.partition("=")
+            if key not in KEYS or not name:
+                raise ValueError(f"--topics: '{part}' is not KEY=NAME with a key of {', '.join(KEYS)}")
+            named[key] = name
+        return cls(named, depth_scale, rectified)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The same as parameters of the node ``bag_player``."""
+        topics = ",".join(f"{key}={name}" for key, name in self.topics.items())
+        return {"topics": topics, "depth_scale": self.depth_scale, "rectified": self.rectified}
+
+    @property
+    def given(self) -> bool:
+        """Whether the user says anything."""
+        return self != CameraOptions()
+
+
+@dataclass(frozen=True)
+class CameraTopics:
+    """The camera's topics in a recording; None for what it does not have.
+
+    Attributes:
+        pose: None where poses come from /tf.
+        depth_info: None where depth is registered to colour.
+        world: frame that counts as the world with /tf, None for "world" or the root of the tree.
+    """
+
+    color: str
+    depth: str
+    info: str
+    pose: str | None
+    depth_info: str | None
+    world: str | None
+
+    def __str__(self) -> str:
+        parts = [f"color={self.color}", f"depth={self.depth}", f"info={self.info}"]
+        parts += [f"depth_info={self.depth_info}"] if self.depth_info else []
+        return ",".join([*parts, f"pose={self.pose}" if self.pose else f"world={self.world or 'world'} (from /tf)"])
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A topic, with the frame and size of its first message."""
+
+    topic: str
+    frame: str
+    size: tuple[int, int] | None
+    encoding: str = ""
+
+
+def find_camera(source: BagSource, options: CameraOptions) -> CameraTopics:
+    """The camera's topics.
+
+    Raises:
+        BagError: a kind of topic is missing, or there are several that could be meant.
+    """
+    first = _first_messages(source)
+    images = [
+        _image(topic, message) for topic, (kind, message) in first.items() if kind in IMAGES and message is not None
+    ]
+    depths = [image for image in images if _is_depth(image)]
+    colors = [image for image in images if not _is_depth(image)]
+    named = options.topics
+    depth = _choose(source, "depth", depths, named, lambda image: "align" in image.topic or "regist" in image.topic)
+    color = _choose(source, "color", colors, named, lambda image: image.frame == depth.frame)
+    infos = [
+        _Candidate(topic, message.header.frame_id, Calibration.from_info(message).image_size)
+        for topic, (kind, message) in first.items()
+        if kind == INFO and message is not None
+    ]
+    depth_info = named.get("depth_info")
+    registered = depth_info is None and depth.frame == color.frame
+    fits = [info for info in infos if info.frame == color.frame] or infos
+    info = _choose(source, "info", fits, named, lambda each: _folder(each.topic) == _folder(color.topic))
+    if not registered and depth_info is None:
+        own = [each for each in infos if each.frame == depth.frame]
+        depth_info = own[0].topic if len(own) == 1 else None
+    return CameraTopics(color.topic, depth.topic, info.topic, _pose(source, named), depth_info, named.get("world"))
+
+
+def _pose(source: BagSource, named: dict[str, str]) -> str | None:
+    poses = sorted({each.topic for each in source.connections if each.msgtype in POSES and "goal" not in each.topic})
+    transforms = any(each.msgtype == TRANSFORMS for each in source.connections)
+    if "world" in named and "pose" not in named and transforms:
+        return None
+    if not poses and transforms and "pose" not in named:
+        return None
+    candidates = [_Candidate(topic, "", None) for topic in poses]
+    return _choose(source, "pose", candidates, named, lambda each: each.topic.endswith(_NAMES["pose"])).topic
+
+
+def _choose(
+    source: BagSource,
+    key: str,
+    candidates: list[_Candidate],
+    named: dict[str, str],
+    prefer: Callable[[_Candidate], bool],
+) -> _Candidate:
+    """The named candidate, the only one, or the only preferred one."""
+    if key in named:
+        found = [each for each in candidates if each.topic == named[key]]
+        if not found:
+            usable = ", ".join(sorted(each.topic for each in candidates)) or "none"
+            raise BagError(
+                f"{source.path}: --topics {key}={named[key]}: not a {key} topic of the bag; there are: {usable}"
+            )
+        return found[0]
+    if not candidates:
+        kinds = {
+            "depth": "depth images",
+            "color": "colour images",
+            "info": "camera_info",
+            "pose": "camera poses or /tf",
+        }
+        there = ", ".join(sorted({each.topic for each in source.connections if each.msgcount})) or "nothing"
+        raise BagError(f"{source.path}: no {kinds[key]} in it; it holds {there}")
+    usual = [each for each in candidates if each.topic.lstrip("/") == _NAMES.get(key)]
+    for group in (candidates, usual, [each for each in candidates if prefer(each)]):
+        if len(group) == 1:
+            return group[0]
+    names = ", ".join(sorted(each.topic for each in candidates))
+    raise BagError(f"{source.path}: several {key} topics ({names}); choose one with --topics {key}=NAME")
+
+
+def _first_messages(source: BagSource) -> dict[str, tuple[str, Any]]:
+    """Topic to its type and first message, for images and camera_info."""
+    wanted = [each for each in source.connections if each.msgtype in IMAGES | {INFO}]
+    missing = {each.topic for each in wanted}
+    first: dict[str, tuple[str, Any]] = {}
+    for connection, _, payload in source.messages(wanted):
+        if connection.topic in missing:
+            missing.discard(connection.topic)
+            first[connection.topic] = connection.msgtype, source.deserialize(payload, connection.msgtype)
+            if not missing:
+                break
+    return first
+
+
+def _image(topic: str, message: Any) -> _Candidate:
+    if hasattr(message, "format"):
+        return _Candidate(topic, message.header.frame_id, None, message.format)
+    return _Candidate(topic, message.header.frame_id, (message.width, message.height), message.encoding)
+
+
+def _is_depth(image: _Candidate) -> bool:
+    return image.encoding.split(";")[0].strip() in _DEPTH_ENCODINGS or "compressedDepth" in image.encoding
+
+
+def _folder(topic: str) -> str:
+    return topic.rpartition("/")[0]

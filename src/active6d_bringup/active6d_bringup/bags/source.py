@@ -1,0 +1,93 @@
+"""Any recording behind one interface: rosbag2 folders and files (MCAP, sqlite3), and ROS 1 bags."""
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.typesys.store import Typestore
+
+from active6d_bringup.bags.writer import TYPESTORE, stamp_of
+
+_FILES = (".mcap", ".db3", ".bag")
+
+
+class BagError(ValueError):
+    """A bag that cannot be read as an episode; the text names it and says what to do."""
+
+
+class BagSource:
+    """An open recording.
+
+    Attributes:
+        path: as it was named.
+        files: what is read: a folder with metadata, or files.
+        connections: topic and type of what is in it.
+    """
+
+    def __init__(self, path: Path, files: list[Path], reader: AnyReader) -> None:
+        self.path, self.files, self._reader = path, files, reader
+        self.connections: list[Connection] = reader.connections
+
+    @property
+    def typestore(self) -> Typestore:
+        """The definitions of its messages."""
+        return self._reader.typestore
+
+    def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
+        """Connection, time of recording (ns) and serialized message, in order of recording."""
+        if connections:
+            yield from self._reader.messages(connections)
+
+    def stamp_of(self, message_type: str, payload: bytes) -> int:
+        """Stamp (ns) of the header that a serialized message begins with."""
+        if self._reader.is2:
+            return stamp_of(message_type, payload)
+        # ROS 1: the header's number, then seconds and nanoseconds, little-endian.
+        return int.from_bytes(payload[4:8], "little") * 1_000_000_000 + int.from_bytes(payload[8:12], "little")
+
+    def deserialize(self, payload: bytes, message_type: str) -> Any:
+        """A message object with the fields of its type."""
+        return self._reader.deserialize(payload, message_type)
+
+
+@contextmanager
+def open_source(path: Path) -> Iterator[BagSource]:
+    """Open a recording.
+
+    Raises:
+        BagError: there is none, or it is damaged; also for what fails while it is read.
+    """
+    files = find_files(path)
+    try:
+        with AnyReader(files, default_typestore=TYPESTORE) as reader:
+            yield BagSource(path, files, reader)
+    except BagError:
+        raise
+    # A damaged file fails anywhere in its decoding, with the error of whichever library was at work.
+    except Exception as error:
+        advice = f"`active6d bag repair {path} NEW_FOLDER` saves what is there"
+        raise BagError(f"{path}: damaged bag, or its recording was killed ({error}); {advice}") from error
+
+
+def find_files(path: Path) -> list[Path]:
+    """What to read: the folder itself where it has metadata.yaml, else its files, or the named file.
+
+    Raises:
+        BagError: nothing to read there.
+    """
+    if path.is_file():
+        if path.suffix not in _FILES:
+            raise BagError(f"{path}: not a bag; bags end in {', '.join(_FILES)} or are folders")
+        return [path]
+    if not path.is_dir():
+        raise BagError(f"{path}: no such folder; name the folder of a bag, or a file ending in {', '.join(_FILES)}")
+    if (path / "metadata.yaml").is_file():
+        return [path]
+    for ending in _FILES:
+        found = sorted(path.glob(f"*{ending}"))
+        if found:
+            return found
+    raise BagError(f"{path}: no metadata.yaml and no file ending in {', '.join(_FILES)}; this is not a bag")

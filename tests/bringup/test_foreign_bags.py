@@ -1,0 +1,309 @@
+"""Recordings of other programs: every storage, transport and naming is read, or refused with its cause."""
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from simulated_driver import plane_view
+
+from active6d_bringup.bags.camera_topics import CameraOptions
+from active6d_bringup.bags.index import read_bag
+from active6d_bringup.bags.reader import read_episodes
+from active6d_bringup.bags.repair import repair
+from active6d_bringup.bags.source import BagError
+from active6d_bringup.bags.summary import summarise
+from active6d_bringup.bags.writer import TYPESTORE
+from active6d_core.camera import PinholeCamera
+from active6d_core.se3 import make_transform, quaternion_from_transform
+from active6d_core.view_sphere import ViewSphere
+
+CAMERA = PinholeCamera(80, 60, 75.0, 75.0, 39.5, 29.5)
+SPHERE = ViewSphere()
+VIEWS = [plane_view(CAMERA, SPHERE.pose(SPHERE.positions[index])) for index in (63, 70, 25)]
+SECOND = 1_000_000_000
+TYPES = TYPESTORE.types
+COLOR, DEPTH, INFO, POSE = (
+    "/driver/color/image_raw",
+    "/driver/aligned_depth/image_raw",
+    "/driver/color/camera_info",
+    "/robot/tool_pose",
+)
+FRAME = "driver_color_optical_frame"
+
+
+def header(stamp, frame, store=TYPESTORE):
+    time = store.types["builtin_interfaces/msg/Time"](stamp // SECOND, stamp % SECOND)
+    extra = (0,) if "seq" in store.types["std_msgs/msg/Header"].__dataclass_fields__ else ()
+    return store.types["std_msgs/msg/Header"](*extra, time, frame)
+
+
+def image(array, encoding, stamp, frame=FRAME, store=TYPESTORE):
+    data = np.ascontiguousarray(array)
+    raw = data.view(np.uint8).reshape(-1)
+    return store.types["sensor_msgs/msg/Image"](
+        header(stamp, frame, store), *array.shape[:2], encoding, 0, raw.size // array.shape[0], raw
+    )
+
+
+def info(stamp, frame=FRAME, store=TYPESTORE, d=(0.0,) * 5, width=80, height=60):
+    K = CAMERA.matrix
+    region = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    P = np.hstack([K, np.zeros((3, 1))]).ravel()
+    numbers = (height, width, "plumb_bob", np.array(d), K.ravel(), np.eye(3).ravel(), P, 0, 0)
+    return store.types["sensor_msgs/msg/CameraInfo"](header(stamp, frame, store), *numbers, region)
+
+
+def pose_of(T, store=TYPESTORE):
+    q = quaternion_from_transform(T[None])[0]
+    point = store.types["geometry_msgs/msg/Point"](*T[:3, 3].tolist())
+    return store.types["geometry_msgs/msg/Pose"](point, store.types["geometry_msgs/msg/Quaternion"](*q.tolist()))
+
+
+def pose(T, stamp, frame="base", store=TYPESTORE):
+    return store.types["geometry_msgs/msg/PoseStamped"](header(stamp, frame, store), pose_of(T, store))
+
+
+def transform(T, stamp, parent, child):
+    q = quaternion_from_transform(T[None])[0]
+    vector = TYPES["geometry_msgs/msg/Vector3"](*T[:3, 3].tolist())
+    moved = TYPES["geometry_msgs/msg/Transform"](vector, TYPES["geometry_msgs/msg/Quaternion"](*q.tolist()))
+    return TYPES["geometry_msgs/msg/TransformStamped"](header(stamp, parent), child, moved)
+
+
+def compressed(data, text, stamp, frame=FRAME):
+    return TYPES["sensor_msgs/msg/CompressedImage"](header(stamp, frame), text, np.frombuffer(data, np.uint8))
+
+
+def driver_messages(store=TYPESTORE):
+    """(time of recording, topic, message) of a driver with its own names, 16UC1 depth and 5 ms skew."""
+    found = []
+    for number, view in enumerate(VIEWS):
+        stamp = (100 + number) * SECOND
+        millimetres = np.rint(view.depth * 1000).astype(np.uint16)
+        found += [
+            (stamp, COLOR, image(view.color, "rgb8", stamp, store=store)),
+            (stamp + 1, DEPTH, image(millimetres, "16UC1", stamp + 5_000_000, store=store)),
+            (stamp + 2, INFO, info(stamp, store=store)),
+            (stamp + 3, POSE, pose(view.T_world_camera, stamp - 2_000_000, store=store)),
+        ]
+    return found
+
+
+def type_of(message):
+    return message.__msgtype__
+
+
+def write(path, messages, plugin=StoragePlugin.MCAP):
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for arrival, topic, message in messages:
+            kind = type_of(message)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=TYPESTORE)
+            writer.write(connections[topic], arrival, TYPESTORE.serialize_cdr(message, kind))
+    return path
+
+
+def assert_views(bag, options=CameraOptions(), views=VIEWS, depth_tolerance=6e-4, color_tolerance=0):
+    index = read_bag(bag, options)
+    steps = [step for episode in read_episodes(index) for step in episode.steps]
+    assert len(steps) == len(views)
+    for step, view in zip(steps, views, strict=True):
+        np.testing.assert_allclose(step.view.T_world_camera, view.T_world_camera, atol=1e-9)
+        np.testing.assert_allclose(step.view.depth, view.depth, atol=depth_tolerance)
+        assert np.abs(step.view.color.astype(int) - view.color).mean() <= color_tolerance
+        assert step.view.camera == CAMERA
+    return index
+
+
+def test_a_folder_of_mcap_is_read_whatever_its_names_and_frames(tmp_path):
+    index = assert_views(write(tmp_path / "bag", driver_messages()))
+    assert index.source == f"color={COLOR},depth={DEPTH},info={INFO},pose={POSE}"
+    assert index.frames == {"world_frame": "world", "camera_frame": "camera_optical_frame"}
+    assert index.left_out == {}
+
+
+def test_sqlite3_is_read(tmp_path):
+    assert_views(write(tmp_path / "bag", driver_messages(), StoragePlugin.SQLITE3))
+
+
+def test_a_lone_file_and_a_folder_without_metadata_are_read(tmp_path):
+    folder = write(tmp_path / "bag", driver_messages())
+    assert_views(next(folder.glob("*.mcap")))
+    (folder / "metadata.yaml").unlink()
+    assert_views(folder)
+
+
+def test_a_ros_1_bag_is_read(tmp_path):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer1(tmp_path / "old.bag") as writer:
+        connections = {}
+        for arrival, topic, message in driver_messages(store):
+            kind = type_of(message)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], arrival, store.serialize_ros1(message, kind))
+    assert_views(tmp_path / "old.bag")
+
+
+def test_compressed_images_in_sqlite3_are_the_same_views(tmp_path):
+    messages = []
+    for arrival, topic, message in driver_messages():
+        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+        if topic == COLOR:
+            pixels = message.data.reshape(60, 80, 3)[..., ::-1]
+            data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+            message = compressed(data, "rgb8; jpeg compressed bgr8", stamp)
+            topic += "/compressed"
+        elif topic == DEPTH:
+            png = cv2.imencode(".png", message.data.view(np.uint16).reshape(60, 80))[1].tobytes()
+            message = compressed(bytes(12) + png, "16UC1; compressedDepth png", stamp)
+            topic += "/compressedDepth"
+        messages.append((arrival, topic, message))
+    assert_views(
+        write(tmp_path / "bag", messages, StoragePlugin.SQLITE3), color_tolerance=12
+    )  # JPEG halves the resolution of colour
+
+
+def test_poses_come_from_transforms_of_a_moving_flange(tmp_path):
+    T_flange_camera = make_transform(np.eye(3), np.array([0.02, 0.0, 0.07]))
+    messages = [entry for entry in driver_messages() if entry[1] != POSE]
+    message = TYPES["tf2_msgs/msg/TFMessage"]
+    messages.append((1, "/tf_static", message([transform(T_flange_camera, 0, "flange", FRAME)])))
+    for number, view in enumerate(VIEWS):
+        stamp = (100 + number) * SECOND + 1_000_000
+        T_base_flange = view.T_world_camera @ np.linalg.inv(T_flange_camera)
+        messages.append((stamp, "/tf", message([transform(T_base_flange, stamp, "base", "flange")])))
+    index = assert_views(write(tmp_path / "bag", sorted(messages, key=lambda entry: entry[0])))
+    assert "from /tf" in index.source
+
+
+@pytest.mark.parametrize("stamps", ["zero", "restarted"])
+def test_useless_stamps_are_replaced_by_the_times_of_recording(tmp_path, stamps):
+    messages = driver_messages()
+    for arrival, _, message in messages:
+        message.header.stamp.sec = 0 if stamps == "zero" else 5 + (arrival // SECOND) % 2
+        message.header.stamp.nanosec = 0
+    index = assert_views(write(tmp_path / "bag", messages))
+    assert index.notes == ["header stamps are missing or go back: times of recording are used"]
+
+
+def test_camera_info_once_is_enough(tmp_path):
+    messages = driver_messages()
+    infos = [entry for entry in messages if entry[1] == INFO]
+    assert_views(write(tmp_path / "bag", [entry for entry in messages if entry not in infos[1:]]))
+
+
+def test_every_view_that_is_left_out_is_counted_with_its_reason(tmp_path):
+    messages = driver_messages()
+    depths = [entry for entry in messages if entry[1] == DEPTH]
+    poses = [entry for entry in messages if entry[1] == POSE]
+    kept = [entry for entry in messages if entry is not depths[0] and entry is not poses[2]]
+    index = read_bag(write(tmp_path / "bag", kept))
+    assert len(index.payloads["camera/pose"]) == 1
+    assert sorted(index.left_out.values()) == [1, 1]
+    assert {reason.split(" within")[0] for reason in index.left_out} == {"no depth image", "no camera pose"}
+
+
+def test_a_stream_gives_one_view_of_each_place_where_the_camera_stood(tmp_path):
+    messages = []
+    for number in range(60):  # 15 Hz: two seconds here, half a second on the way, the rest there
+        stamp = 100 * SECOND + number * 66_000_000
+        start, end = (view.T_world_camera for view in VIEWS[:2])
+        share = np.clip((number - 30) / 8, 0, 1)
+        position = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
+        T = {0.0: start, 1.0: end}.get(share, SPHERE.pose(position))
+        view = plane_view(CAMERA, T)
+        millimetres = np.rint(view.depth * 1000).astype(np.uint16)
+        messages += [
+            (stamp, COLOR, image(view.color, "rgb8", stamp)),
+            (stamp + 1, DEPTH, image(millimetres, "16UC1", stamp)),
+            (stamp + 2, INFO, info(stamp)),
+            (stamp + 3, POSE, pose(T, stamp)),
+        ]
+    index = assert_views(write(tmp_path / "bag", messages), views=VIEWS[:2])
+    assert sum(index.left_out.values()) == 58
+
+
+def test_topics_can_be_chosen_and_must_be_where_several_could_be_meant(tmp_path):
+    messages = driver_messages()
+    twin = [(arrival, topic.replace("driver", "left"), message) for arrival, topic, message in messages]
+    bag = write(tmp_path / "bag", sorted(messages + [entry for entry in twin if entry[1] != POSE], key=lambda e: e[0]))
+    with pytest.raises(BagError, match=r"several depth topics \(/driver/.*, /left/.*choose one with --topics depth="):
+        read_bag(bag)
+    chosen = CameraOptions.parse(f"depth={DEPTH},color={COLOR}")
+    assert_views(bag, chosen)
+    with pytest.raises(BagError, match="there are: /driver/aligned_depth"):
+        read_bag(bag, CameraOptions.parse("depth=/nothing"))
+    with pytest.raises(ValueError, match="is not KEY=NAME"):
+        CameraOptions.parse("colour=/x")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"unit": 10_000}, "depth is 10 times what it can be"),
+        ({"depth_frame": "driver_depth"}, "depth in 'driver_depth': use the driver's depth that is aligned"),
+        ({"size": (160, 120)}, "camera_info is for 160x120 images, these are 80x60"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_cause(tmp_path, change, words):
+    messages = []
+    for arrival, topic, message in driver_messages():
+        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+        if topic == DEPTH:
+            steps = (message.data.view(np.uint16).reshape(60, 80) * (change.get("unit", 1000) / 1000)).astype(np.uint16)
+            message = image(steps, "16UC1", stamp, change.get("depth_frame", FRAME))
+        elif topic == INFO and "size" in change:
+            message = info(stamp, width=change["size"][0], height=change["size"][1])
+        messages.append((arrival, topic, message))
+    bag = write(tmp_path / "bag", messages)
+    with pytest.raises(BagError, match=words):
+        read_bag(bag)
+    if "unit" in change:
+        assert_views(bag, CameraOptions(depth_scale=1e-4))
+
+
+def test_a_bag_without_depth_names_what_it_holds(tmp_path):
+    bag = write(tmp_path / "bag", [entry for entry in driver_messages() if entry[1] != DEPTH])
+    with pytest.raises(BagError, match=f"no depth images in it; it holds {INFO}, {COLOR}, {POSE}"):
+        read_bag(bag)
+
+
+def test_a_summary_lists_every_topic(tmp_path):
+    summary = summarise(write(tmp_path / "bag", driver_messages()))
+    rows = {row.name: row for row in summary.topics}
+    assert (rows[COLOR].count, rows[COLOR].content, rows[COLOR].frame) == (3, "80x60 rgb8", FRAME)
+    assert rows[COLOR].rate_hz == pytest.approx(1.0)
+    assert summary.messages == 12
+
+
+@pytest.mark.parametrize("keep", [0.5, 0.8, 0.999])
+def test_what_a_killed_recording_wrote_is_repaired(tmp_path, keep):
+    first = driver_messages()
+    many = [(arrival + 10 * lap * SECOND, topic, message) for lap in range(40) for arrival, topic, message in first]
+    whole = write(tmp_path / "bag", many)
+    file = next(whole.glob("*.mcap"))
+    cut = tmp_path / "killed"
+    cut.mkdir()
+    (cut / file.name).write_bytes(file.read_bytes()[: int(keep * file.stat().st_size)])
+    with pytest.raises(BagError, match="active6d bag repair"):
+        read_bag(cut)
+    saved = repair(cut, tmp_path / "saved")
+    assert saved.damage
+    assert 0 < saved.messages <= len(many)
+    assert summarise(tmp_path / "saved").messages == saved.messages
+    if keep > 0.9:
+        assert saved.messages > 0.9 * len(many)
+
+
+def test_repair_refuses_what_holds_nothing(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BagError, match="this is not a bag"):
+        repair(tmp_path / "empty", tmp_path / "saved")
+    (tmp_path / "empty" / "a.mcap").write_bytes(b"something else")
+    with pytest.raises(BagError, match="not one message can be read"):
+        repair(tmp_path / "empty", tmp_path / "saved")
+    assert not (tmp_path / "saved").exists()
