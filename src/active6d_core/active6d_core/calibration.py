@@ -8,6 +8,8 @@ import numpy as np
 from active6d_core.camera import PinholeCamera
 
 _SAME_PIXELS = 1e-3
+#: Distortion models that with D = 0 leave an image as it is; a fisheye lens bends rays all the same.
+_NONE_WITHOUT_COEFFICIENTS = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "inverse_brown_conrady")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,8 @@ class Calibration:
     @property
     def distorted(self) -> bool:
         """Whether raw and rectified images differ by more than their intrinsics."""
-        return bool(np.any(self.D)) or not np.allclose(self.R, np.eye(3), atol=1e-6)
+        bent = bool(np.any(self.D)) or self.model not in _NONE_WITHOUT_COEFFICIENTS
+        return bent or not np.allclose(self.R, np.eye(3), atol=1e-6)
 
     @property
     def knows_raw(self) -> bool:

@@ -56,8 +56,6 @@ _DTYPES = {
     PointField.FLOAT64: "<f8",
 }
 _DATATYPES = {dtype: datatype for datatype, dtype in _DTYPES.items()}
-#: Distortion models that with d = 0 leave an image as it is.
-_WITHOUT_DISTORTION = ("", "none", "plumb_bob", "rational_polynomial", "brown_conrady", "inverse_brown_conrady")
 #: Encodings of colour images that the graph uses, with the places of red, green and blue.
 COLOR_ENCODINGS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
 #: A quaternion whose norm is further from one than this was not meant as a rotation.
@@ -312,7 +310,7 @@ def info_to_camera(message: CameraInfo) -> PinholeCamera:
     """
     with refusing("camera_info: "):
         calibration = Calibration.from_info(message)
-        if calibration.distorted or calibration.model not in _WITHOUT_DISTORTION:
+        if calibration.distorted:
             raise MessageError(
                 "camera_info has distortion; put the node camera_adapter between driver and graph, "
                 "or publish d = 0 and plumb_bob if the images are rectified already"
