@@ -191,7 +191,7 @@ def test_broken_images_are_named(folder):
         scene.view(1, 0)
     scene.view(0, 0)
     Image.new("RGB", (64, 48)).save(depth)
-    with pytest.raises(ValueError, match=r"depth/000001\.png: a depth image has one channel, this one 3"):
+    with pytest.raises(ValueError, match=r"depth/000001\.png: is a colour image, depth needs 16-bit"):
         scene.view(1, 0)
     depth.write_bytes(b"no image")
     with pytest.raises(ValueError, match=r"depth/000001\.png: not an image"):

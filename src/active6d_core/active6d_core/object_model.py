@@ -16,6 +16,8 @@ import yaml
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
+from active6d_core.mesh_file import check_diameter, close_mesh, load_mesh
+
 SHIPPED_OBJECTS = Path(__file__).parent / "objects"
 _REQUIRED = {"name", "instances", "color"}
 _OPTIONAL = {"mesh", "profile", "scale", "symmetry", "features", "source"}
@@ -189,16 +191,13 @@ def _load_mesh(description: dict[str, Any], path: Path) -> tuple[trimesh.Trimesh
     if "profile" in description:
         mesh = trimesh.creation.revolve(np.array(description["profile"], float), sections=96)
     else:
-        mesh_path = path.parent / description["mesh"]
-        if not mesh_path.is_file():
-            raise ValueError(f"mesh {mesh_path} does not exist")
-        mesh = trimesh.load_mesh(mesh_path)
+        mesh = load_mesh(path.parent / description["mesh"])
     scale = float(description.get("scale", 1.0))
     if not 0 < scale < np.inf:
         raise ValueError(f"scale must be positive, got {scale}")
     mesh.apply_scale(scale)  # type: ignore[no-untyped-call]
-    if not len(mesh.faces) or mesh.volume <= 0:
-        raise ValueError("mesh has no faces, or its faces point inwards (negative volume)")
+    check_diameter(_diameter(mesh), scale)
+    close_mesh(mesh)
     # With the origin at the centre of mass, physics needs no inertial offset, and ADD depends less on rotation errors.
     origin = np.array(mesh.center_mass)
     mesh.apply_translation(-origin)

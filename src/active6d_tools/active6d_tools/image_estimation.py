@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw
 
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
+from active6d_core.images import read_color, read_depth
 from active6d_core.object_model import ObjectModel
 from active6d_core.rgbd import make_view
 from active6d_perception.active6d import Active6D
@@ -58,15 +59,15 @@ def read_image(rgb: Path, depth: Path, intrinsics: Path, depth_scale: float | No
     """One view from a colour file, a depth file and intrinsics.
 
     Args:
-        rgb: picture of 8 bits a channel.
-        depth: 16-bit picture, or a ``.npy`` array.
+        rgb: picture of any usual kind, or a ``.npy`` array of 8 bits a channel.
+        depth: 16-bit or floating-point picture, or a ``.npy`` array.
         intrinsics: JSON file with ``K`` or ``cam_K``: 9 numbers in pixels, row by row.
         depth_scale: metres per unit of the depth file, None for 0.001 with integers and 1 with floating point.
 
     Raises:
         ValueError: a file is missing or damaged, or its content cannot be meant; the message names it.
     """
-    color, distances = _read_array(rgb), _read_array(depth)
+    color, distances = _read_array(rgb, read_color), _read_array(depth, read_depth)
     K = _read_matrix(intrinsics)
     try:
         return make_view(color, distances, K, depth_scale=depth_scale)
@@ -172,17 +173,15 @@ class Overlay:
         return picture
 
 
-def _read_array(path: Path) -> np.ndarray:
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+def _read_array(path: Path, read_image_file: Callable[[Path], np.ndarray]) -> np.ndarray:
+    """A ``.npy`` array as it is, an image as ``read_image_file`` gives it."""
+    if path.suffix != ".npy":
+        return read_image_file(path)
     try:
-        if path.suffix == ".npy":
-            return np.load(path, allow_pickle=False)
-        with Image.open(path) as picture:
-            return np.array(picture)
-    # Pillow's decoders raise many kinds on damaged files, SyntaxError among them.
+        return np.load(path, allow_pickle=False)
+    # NumPy raises many kinds of errors on damaged files.
     except Exception as error:
-        raise ValueError(f"{path}: not a readable image ({error})") from error
+        raise ValueError(f"{path}: not a readable array ({error})") from error
 
 
 def _read_matrix(path: Path) -> np.ndarray:

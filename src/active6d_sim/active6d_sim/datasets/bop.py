@@ -17,11 +17,14 @@ import numpy as np
 from PIL import Image
 
 from active6d_core.camera import PinholeCamera, View
+from active6d_core.images import read_color, read_depth
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform, transform_from_quaternion
 
 CAMERA_FILE, TRUTH_FILE, VISIBILITY_FILE = "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
 #: Published datasets round rotations to about six digits; matrices farther from orthonormal are refused.
 _ROTATION_TOLERANCE = 1e-3
+#: Of images, in order of search.
+_ENDINGS = ("png", "jpg", "jpeg", "tif", "tiff")
 _DEEPEST = np.iinfo(np.uint16).max
 
 
@@ -106,15 +109,11 @@ class BopScene:
             ValueError: an image is damaged or has another kind of pixels; the message names the file.
         """
         camera, image = self.cameras[index], self.image_ids[index]
-        color = _read_pixels(_image_path(self.folder, "rgb", image), camera)
-        depth_path = _image_path(self.folder, "depth", image)
-        steps = _read_pixels(depth_path, camera)
-        if color.ndim == 2:
-            color = np.repeat(color[..., None], 3, axis=2)
-        if steps.ndim != 2:
-            raise ValueError(f"{depth_path}: a depth image has one channel, this one {steps.shape[2]}")
+        color_path, depth_path = (_image_path(self.folder, kind, image) for kind in ("rgb", "depth"))
+        color = _require_size(read_color(color_path), color_path, camera)
+        steps = _require_size(read_depth(depth_path), depth_path, camera)
         depth = np.where(steps > 0, steps * (self.depth_scale[index] * 1e-3), np.nan).astype(np.float32)
-        return View(stamp, np.ascontiguousarray(color[..., :3], np.uint8), depth, camera, self.T_world_camera[index])
+        return View(stamp, color, depth, camera, self.T_world_camera[index])
 
     def nearest(self, position: np.ndarray) -> int:
         """Index of the view whose direction from the world's origin is nearest to that of (3,) ``position``, metres."""
@@ -271,9 +270,13 @@ def _read_camera_pose(entry: Any, path: Path, image: int, needed: bool) -> np.nd
 
 
 def _image_path(folder: Path, kind: str, image: int) -> Path:
-    """Path of an image; published datasets have colour as PNG or JPEG."""
-    png, jpg = (folder / kind / f"{image:06d}.{ending}" for ending in ("png", "jpg"))
-    return png if png.is_file() or not jpg.is_file() else jpg
+    """Path of an image: published datasets name and store them in several ways; the first usual name if there is none.
+
+    Grey cameras have a folder ``gray`` in place of ``rgb``.
+    """
+    folders = ("rgb", "gray") if kind == "rgb" else (kind,)
+    candidates = [folder / each / f"{image:06d}.{ending}" for each in folders for ending in _ENDINGS]
+    return next((path for path in candidates if path.is_file()), candidates[0])
 
 
 def _size(path: Path) -> tuple[int, int]:
@@ -287,14 +290,8 @@ def _size(path: Path) -> tuple[int, int]:
         raise ValueError(f"{path}: not an image ({error})") from error
 
 
-def _read_pixels(path: Path, camera: PinholeCamera) -> np.ndarray:
-    """(H, W) or (H, W, channels) of the camera's size."""
-    try:
-        with Image.open(path) as picture:
-            pixels = np.array(picture)
-    # Pillow's decoders raise many kinds of errors on damaged files, including SyntaxError.
-    except Exception as error:
-        raise ValueError(f"{path}: not a readable image ({error})") from error
+def _require_size(pixels: np.ndarray, path: Path, camera: PinholeCamera) -> np.ndarray:
+    """The same pixels, if they are of the camera's size."""
     if pixels.shape[:2] != (camera.height, camera.width):
         raise ValueError(f"{path}: is {pixels.shape[:2][::-1]} pixels, was {(camera.width, camera.height)}")
     return pixels

@@ -76,7 +76,10 @@ def show(
 
 @app.command()
 def add(
-    mesh: Annotated[Path, typer.Argument(help="Triangle mesh (ply, stl, obj, off or glb) with outward normals.")],
+    mesh: Annotated[
+        Path,
+        typer.Argument(help="Triangle mesh (ply, stl, obj, off or glb); small holes are closed."),
+    ],
     name: Annotated[str, typer.Option(help="Name of the new object.")],
     scale: Annotated[float, typer.Option(help="Unit of the mesh in metres, such as 0.001 for millimetres.")] = 1.0,
     axis: Annotated[
@@ -103,6 +106,7 @@ def add(
 
     import yaml
 
+    from active6d_core.mesh_file import close_mesh, load_mesh
     from active6d_core.object_model import read_description
 
     if not name.replace("_", "").replace("-", "").isalnum():
@@ -126,7 +130,10 @@ def add(
         description_path.unlink(missing_ok=True)
         mesh_path.unlink()
         raise ValueError(f"{mesh} cannot be added: {error}") from error
-    console.print(f"added {name}: {1e3 * model.diameter:.1f} mm in diameter", highlight=False, markup=False)
+    for repair in close_mesh(load_mesh(mesh)):
+        console.print(f"repaired each time it is loaded: {repair}", highlight=False, markup=False)
+    size = " x ".join(f"{1e3 * extent:.1f}" for extent in model.mesh.extents)
+    console.print(f"added {name}: {1e3 * model.diameter:.1f} mm in diameter ({size} mm)", highlight=False, markup=False)
     folders = os.environ.get("ACTIVE6D_OBJECT_PATH", "").split(os.pathsep)
     if str(into) not in folders and str(into.resolve()) not in folders:
         console.print(f"export ACTIVE6D_OBJECT_PATH={into.resolve()}", highlight=False, markup=False)

@@ -1,0 +1,87 @@
+"""Triangle meshes as users bring them: loaded, repaired where that is safe, else refused with the likely cause."""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+#: Diameters in metres that an object in a bin can have; others are of another unit.
+PLAUSIBLE_DIAMETER = (0.002, 2.0)
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres": 1.0}
+
+
+def load_mesh(path: Path) -> trimesh.Trimesh:
+    """One mesh of a file's triangles, in the file's frame and unit.
+
+    Raises:
+        ValueError: no file, no triangles, or vertices that are not finite.
+    """
+    if not path.is_file():
+        raise ValueError(f"mesh {path} does not exist")
+    try:
+        mesh = trimesh.load_mesh(path)
+    # Readers of meshes raise many kinds of errors on damaged files.
+    except Exception as error:
+        raise ValueError(f"mesh {path.name} cannot be read ({error})") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise ValueError(f"mesh {path.name} has no faces; a point cloud has no surface")
+    if not np.isfinite(mesh.vertices).all():
+        raise ValueError(f"mesh {path.name} has vertices that are not finite")
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def close_mesh(mesh: trimesh.Trimesh) -> list[str]:
+    """Turn faces outwards and close holes, in place, where a mesh does not say what is inside.
+
+    A mesh that is closed, or encloses its centre of mass with outward faces, stays as it is.
+
+    Returns:
+        what was done, in words.
+
+    Raises:
+        ValueError: afterwards there is still no inside.
+    """
+    done = []
+    faces = len(mesh.faces)
+    closed = mesh.copy()
+    if not mesh.is_watertight and trimesh.repair.fill_holes(closed):
+        mesh.vertices, mesh.faces = closed.vertices, closed.faces
+        done.append(f"holes closed with {len(mesh.faces) - faces} faces")
+    if not _has_inside(mesh):
+        before = mesh.face_normals[:faces].copy()
+        trimesh.repair.fix_winding(mesh)
+        if mesh.volume < 0:
+            mesh.faces = np.fliplr(mesh.faces)
+        turned = int((np.einsum("ij,ij->i", before, mesh.face_normals[:faces]) < 0).sum())
+        if turned:
+            done.append(f"{turned} of {faces} faces turned outwards")
+    if not _has_inside(mesh):
+        edges = int((np.bincount(trimesh.grouping.unique_rows(mesh.edges_sorted)[1]) == 1).sum())
+        raise ValueError(
+            f"mesh has no inside: it is open at {edges} edges, or its faces do not agree on what is outside; "
+            "close it in a mesh editor, such as MeshLab"
+        )
+    return done
+
+
+def check_diameter(diameter: float, scale: float) -> None:
+    """Raise ValueError where an object of this diameter (metres) must be of another unit than ``scale`` says."""
+    low, high = PLAUSIBLE_DIAMETER
+    if low <= diameter <= high:
+        return
+    fitting = [
+        f"{unit}: scale {factor:g} makes it {1e3 * diameter / scale * factor:.0f} mm"
+        for unit, factor in _UNITS.items()
+        if low <= diameter / scale * factor <= high
+    ]
+    advice = f"; is it in {', or in '.join(fitting)}?" if fitting else ""
+    raise ValueError(f"with scale {scale:g} the object is {diameter:.4g} m in diameter{advice}")
+
+
+def _has_inside(mesh: trimesh.Trimesh) -> bool:
+    """Whether faces are turned outwards around a centre of mass within the bounds."""
+    if not mesh.is_winding_consistent or mesh.volume <= 0:
+        return False
+    low, high = mesh.bounds
+    return bool(((mesh.center_mass >= low) & (mesh.center_mass <= high)).all())

@@ -1,0 +1,93 @@
+"""Meshes as users bring them: repaired where that is safe, else refused with the likely cause."""
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from active6d_core.mesh_file import close_mesh, load_mesh
+from active6d_core.object_model import read_description
+
+BOX = trimesh.creation.box((0.08, 0.06, 0.04))
+
+
+def describe(tmp_path, mesh, ending="ply", scale=1.0):
+    mesh.export(tmp_path / f"part.{ending}")
+    keys = {"name": "part", "mesh": f"part.{ending}", "scale": scale, "instances": [1, 2], "color": [0.5, 0.5, 0.5]}
+    (tmp_path / "part.yaml").write_text(yaml.safe_dump(keys))
+    return tmp_path / "part.yaml"
+
+
+def open_box(shift=(0, 0, 0)):
+    mesh = BOX.copy()
+    mesh.update_faces(mesh.face_normals[:, 2] > -0.5)
+    mesh.remove_unreferenced_vertices()
+    mesh.apply_translation(shift)
+    return mesh
+
+
+@pytest.mark.parametrize("shift", [(0, 0, 0), (0.5, 0.2, 0.1), (0, 0, 1.0), (0, 0, -1.0)])
+def test_an_open_box_is_closed_wherever_it_lies(tmp_path, shift):
+    model = read_description(describe(tmp_path, open_box(shift)))
+    np.testing.assert_allclose(model.origin, shift, atol=1e-5)
+    np.testing.assert_allclose(model.mesh.bounds, BOX.bounds, atol=1e-5)
+
+
+@pytest.mark.parametrize("turned", [slice(None), slice(0, 4)])
+def test_faces_that_point_inwards_are_turned(tmp_path, turned):
+    mesh = BOX.copy()
+    faces = mesh.faces.copy()
+    faces[turned] = faces[turned, ::-1]
+    mesh = trimesh.Trimesh(mesh.vertices, faces, process=False)
+    model = read_description(describe(tmp_path, mesh))
+    assert model.mesh.volume == pytest.approx(BOX.volume, rel=1e-4)
+    outward = np.einsum("ij,ij->i", model.mesh.face_normals, model.mesh.triangles_center)
+    assert (outward > 0).all()
+
+
+def test_a_sound_mesh_stays_as_it_is():
+    mesh = BOX.copy()
+    assert close_mesh(mesh) == []
+    np.testing.assert_array_equal(mesh.faces, BOX.faces)
+
+
+def test_what_was_done_is_said():
+    assert close_mesh(open_box((0, 0, 1.0))) == ["holes closed with 2 faces"]
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (1000.0, r"107.7 m in diameter; is it in millimetres: scale 0.001 makes it 108 mm"),
+        (1e-3, "0.0001077 m in diam"),
+    ],
+)
+def test_an_impossible_size_asks_for_the_unit(tmp_path, factor, words):
+    mesh = BOX.copy()
+    mesh.apply_scale(factor)
+    with pytest.raises(ValueError, match=words):
+        read_description(describe(tmp_path, mesh, "stl"))
+    if factor > 1:
+        assert read_description(describe(tmp_path, mesh, "stl", 1e-3)).diameter == pytest.approx(0.1077, rel=1e-3)
+
+
+def test_a_sheet_has_no_inside(tmp_path):
+    sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.1, 0.05, 0], [0, 0.05, 0]], [[0, 1, 2], [0, 2, 3]])
+    with pytest.raises(ValueError, match="mesh has no inside: it is open at 4 edges"):
+        read_description(describe(tmp_path, sheet))
+
+
+def test_points_and_broken_numbers_are_refused(tmp_path):
+    trimesh.PointCloud(np.random.default_rng(0).random((50, 3))).export(tmp_path / "cloud.ply")
+    with pytest.raises(ValueError, match="no faces"):
+        load_mesh(tmp_path / "cloud.ply")
+    BOX.export(tmp_path / "box.off")
+    text = (tmp_path / "box.off").read_text()
+    (tmp_path / "box.off").write_text(text.replace("-0.04", "nan", 1))
+    with pytest.raises(ValueError, match=r"not finite|cannot be read"):
+        load_mesh(tmp_path / "box.off")
+
+
+def test_a_stray_vertex_does_not_make_the_object_large(tmp_path):
+    mesh = trimesh.Trimesh(np.vstack([BOX.vertices, [[10, 10, 10]]]), BOX.faces, process=False)
+    assert read_description(describe(tmp_path, mesh)).diameter == pytest.approx(0.1077, rel=1e-3)
