@@ -8,6 +8,7 @@ from hand_made_scenes import CAMERA, SPHERE, three_mugs
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
+from active6d_core.object_model import load_object
 from active6d_core.ros.conversions import (
     image_to_color,
     image_to_depth,
@@ -39,7 +40,8 @@ def recorded():
 
 @pytest.fixture
 def folder(recorded, tmp_path):
-    write_bop_scene(tmp_path / "scene", recorded, three_mugs().T_world_object, 3)
+    T_world_mesh = load_object("mug").T_camera_mesh(three_mugs().T_world_object)
+    write_bop_scene(tmp_path / "scene", recorded, T_world_mesh, 3)
     return tmp_path / "scene"
 
 

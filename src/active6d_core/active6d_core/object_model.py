@@ -79,6 +79,15 @@ class ObjectModel:
         T_object_mesh[:3, 3] = -self.origin
         return np.asarray(T_camera_object) @ T_object_mesh
 
+    def T_camera_object(self, T_camera_mesh: np.ndarray) -> np.ndarray:
+        """(k, 4, 4) poses of the frame of the mesh file, scaled to metres, as object poses.
+
+        Data sets such as BOP's give poses in that frame.
+        """
+        T_mesh_object = np.eye(4)
+        T_mesh_object[:3, 3] = self.origin
+        return np.asarray(T_camera_mesh) @ T_mesh_object
+
     @cached_property
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """(8192, 3) random surface points with a fixed seed, metres, and their (8192, 3) outward unit normals."""

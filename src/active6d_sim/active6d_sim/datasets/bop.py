@@ -4,7 +4,8 @@ The format is described in ``docs/bop_datasets_format.md`` of https://github.com
 
 A folder holds ``scene_camera.json`` (intrinsics and the camera's pose in the world), ``rgb/NNNNNN.png``,
 ``depth/NNNNNN.png`` (16 bit, 0 without a return) and, optionally, ``scene_gt.json`` (object poses in the camera) and
-``scene_gt_info.json`` (visible fractions). Lengths are millimetres on disk and metres here.
+``scene_gt_info.json`` (visible fractions). Poses of objects are those of the model file's frame. Lengths are
+millimetres on disk and metres here.
 """
 
 import json
@@ -147,7 +148,7 @@ def write_bop_scene(
     Args:
         folder: folder to write, created if it does not exist.
         views: m views of the camera.
-        T_world_object: (n, 4, 4) true poses in the world, metres, the same in all views.
+        T_world_object: (n, 4, 4) true poses of the model file's frame in the world, metres, the same in all views.
         object_id: BOP's number of the objects' model, from 1.
         visible_fraction: (m, n) for ``scene_gt_info.json``; without it the file is not written.
         depth_scale: millimetres per step of the depth image; depth beyond 65535 steps is written as missing.

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from active6d_core.camera import View
+from active6d_core.object_model import load_object
 from active6d_core.ros.conversions import MessageError
 from active6d_core.ros.runner import run_node
 from active6d_sim.datasets.bop import BopScene
@@ -46,10 +47,11 @@ class DatasetCameraNode(MovingCameraNode):
         return self._scene.T_world_camera[view]
 
     def truth(self, view: int) -> np.ndarray | None:
-        """The objects' poses in that image's ground truth, if the recording has any."""
-        return (
-            self._scene.T_world_object(view, self.value("object_id") or None) if self._scene.truth is not None else None
-        )
+        """The objects' poses in that image's ground truth, if the recording has any, in the frame of the object."""
+        if self._scene.truth is None:
+            return None
+        T_world_mesh = self._scene.T_world_object(view, self.value("object_id") or None)
+        return load_object(self.object_name).T_camera_object(T_world_mesh)
 
     def destination(self, T_world_goal: np.ndarray) -> np.ndarray:
         """The recorded view nearest in direction to the goal."""

@@ -1,4 +1,4 @@
-"""``active6d scenes generate|report|show``."""
+"""``active6d scenes generate|export|report|show``."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +9,7 @@ from active6d_tools.cli.options import JsonFile, ObjectName, Seed, SensorName, S
 from active6d_tools.cli.output import write_json, write_png
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
-app = typer.Typer(help="Stored scenes: generate, report, show.", rich_markup_mode="rich")
+app = typer.Typer(help="Stored scenes: generate, export, report, show.", rich_markup_mode="rich")
 
 
 @app.command()
@@ -41,6 +41,51 @@ def generate(
     console.print(f"{total} scenes in {into / object_name}", highlight=False, markup=False)
     if str(into.resolve()) not in os.environ.get("ACTIVE6D_SCENE_PATH", "").split(os.pathsep):
         console.print(f"export ACTIVE6D_SCENE_PATH={into.resolve()}", highlight=False, markup=False)
+
+
+@app.command()
+def export(
+    bop: Annotated[Path, typer.Option("--bop", metavar="DIR", help="Folder of the BOP data set to write.")],
+    object_name: ObjectName = "mug",
+    split: Split = "test",
+    count: Annotated[int | None, typer.Option(min=1, help="Number of scenes; by default all of the split.")] = None,
+    view: Annotated[
+        list[int] | None,
+        typer.Option(min=0, help="Number of a view of the grid; repeatable. By default every fourth view."),
+    ] = None,
+    sensor: SensorName = "auto",
+    seed: Seed = 0,
+) -> None:
+    """Write stored scenes as a BOP data set: images, camera poses, ground truth, visible fractions, model.
+
+    Poses are those of the mesh file's frame, in millimetres.
+
+    Example: [bold]active6d scenes export --bop dataset --object mug --split test --count 2[/bold]
+    """
+    from active6d_core.object_model import load_object
+    from active6d_core.view_sphere import ViewSphere
+    from active6d_sim.datasets.bop_export import export_scenes
+    from active6d_sim.scenes.scene_store import SPLITS, load_scene
+
+    model = load_object(object_name)
+    if split not in SPLITS:
+        raise ValueError(f"--split '{split}' is not among {', '.join(SPLITS)}")
+    total = min(count or SPLITS[split], SPLITS[split])
+    views = view or list(range(0, len(ViewSphere()), 4))
+    scenes = (load_scene(object_name, split, index) for index in range(total))
+    with progress_bar() as progress:
+        task = progress.add_task("rendering", total=total)
+        export_scenes(
+            bop,
+            model,
+            split,
+            scenes,
+            views,
+            sensor,
+            seed=seed,
+            on_scene=lambda name: progress.update(task, advance=1, description=name),
+        )
+    console.print(f"{total} scenes with {len(views)} images each in {bop / split}", highlight=False, markup=False)
 
 
 @app.command()
