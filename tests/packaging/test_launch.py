@@ -127,3 +127,25 @@ def test_the_nodes_that_a_camera_needs_are_started(names, given, started):
 def test_a_node_that_refuses_its_parameters_ends_the_launch(names, code, ends):
     event = SimpleNamespace(returncode=code, process_name="pose_estimator-1")
     assert bool(names["_end_on_bad_parameters"](event, None)) is ends
+
+
+def test_a_cell_is_the_graph_with_the_adapter_and_a_recorder(monkeypatch):
+    """Its arguments are the graph's, all described; what has no default must be given."""
+    included = MagicMock()
+    modules = ("launch", "launch.actions", "launch.launch_description_sources", "launch.substitutions")
+    for module in modules:
+        monkeypatch.setitem(sys.modules, module, MagicMock())
+    sys.modules["launch.actions"].IncludeLaunchDescription = included
+    monkeypatch.setattr(
+        "ament_index_python.packages.get_package_share_directory", lambda package: str(LAUNCH.parents[1])
+    )
+    cell = runpy.run_path(str(LAUNCH.with_name("cell.launch.py")))
+    cell["generate_launch_description"]()
+    given = dict(included.call_args.kwargs["launch_arguments"])
+    graph = {name for name, _ in items("ARGUMENTS")}
+    assert (given["camera"], given["record"]) == ("adapter", "true")
+    assert given.keys() == cell["ARGUMENTS"].keys() | {"camera", "record"}
+    assert given.keys() <= graph
+    needed = {name for name, (default, _) in cell["ARGUMENTS"].items() if default is None}
+    assert needed == {"object", "params_file", "bag"}
+    assert all(len(description) > 10 for _, description in cell["ARGUMENTS"].values())
