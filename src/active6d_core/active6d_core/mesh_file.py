@@ -50,14 +50,14 @@ def close_mesh(mesh: trimesh.Trimesh) -> list[str]:
         done.append(f"holes closed with {len(mesh.faces) - faces} faces")
     if not _has_inside(mesh):
         before = mesh.face_normals[:faces].copy()
-        trimesh.repair.fix_winding(mesh)
+        trimesh.repair.fix_winding(mesh)  # type: ignore[no-untyped-call]
         if mesh.volume < 0:
             mesh.faces = np.fliplr(mesh.faces)
         turned = int((np.einsum("ij,ij->i", before, mesh.face_normals[:faces]) < 0).sum())
         if turned:
             done.append(f"{turned} of {faces} faces turned outwards")
     if not _has_inside(mesh):
-        edges = int((np.bincount(trimesh.grouping.unique_rows(mesh.edges_sorted)[1]) == 1).sum())
+        edges = int((np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1] == 1).sum())
         raise ValueError(
             f"mesh has no inside: it is open at {edges} edges, or its faces do not agree on what is outside; "
             "close it in a mesh editor, such as MeshLab"

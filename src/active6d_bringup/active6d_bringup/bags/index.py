@@ -95,7 +95,8 @@ def read_bag(path: Path, options: CameraOptions = CameraOptions()) -> BagIndex:
     Raises:
         BagError: no bag, or one without a usable view.
     """
-    index, damage = None, ()
+    index: BagIndex | None = None
+    damage: tuple[str, ...] = ()
     if not options.given and ((path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))):
         index, damage = _read_own(path)
     if index is not None:

@@ -78,7 +78,7 @@ def write_model(folder: Path, model: ObjectModel, object_id: int = 1) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     mesh = model.mesh.copy()
     mesh.apply_translation(model.origin)
-    mesh.apply_scale(_MILLIMETRES)
+    mesh.apply_scale(_MILLIMETRES)  # type: ignore[no-untyped-call]
     mesh.export(folder / f"obj_{object_id:06d}.ply")
     low, high = mesh.bounds
     info: dict[str, Any] = {"diameter": _MILLIMETRES * model.diameter}

@@ -26,8 +26,8 @@ def info(folder: BagFolder, json_file: JsonFile = None) -> None:
         summary = summarise(folder)
     table = Table(box=None, pad_edge=False)
     for column in ("topic", "type", "messages", "Hz", "frame", "first message"):
-        justify = "right" if column in ("messages", "Hz") else "left"
-        table.add_column(column, header_style="dim", justify=justify, overflow="fold")
+        number = column in ("messages", "Hz")
+        table.add_column(column, header_style="dim", justify="right" if number else "left", overflow="fold")
     for row in summary.topics:
         rate = "-" if row.rate_hz is None else f"{row.rate_hz:.1f}"
         table.add_row(row.name, row.type, str(row.count), rate, row.frame, row.content)
