@@ -35,5 +35,5 @@ setup(
         "trimesh",
         "typer",
     ],
-    entry_points={"console_scripts": ["active6d = active6d_tools.cli:main"]},
+    entry_points={"console_scripts": ["active6d = active6d_tools.command:main"]},
 )

@@ -76,6 +76,25 @@ def test_killed_estimator_comes_back_and_the_episode_ends_as_ever(graphs, tmp_pa
         np.testing.assert_array_equal(recorded.objects.T_world_object, expected.objects.T_world_object)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("victim", "number"), [("episode_recorder", signal.SIGKILL), ("pose_estimator", signal.SIGSTOP)]
+)
+def test_killed_recorder_and_hung_estimator_come_back(graphs, tmp_path, victim, number):
+    def strike(step):
+        if step.index == 1:
+            os.kill(graphs[0].processes[victim].pid, number)
+
+    events = []
+    result = run_episode(settings(tmp_path / "bag"), strike, events.append)
+    assert any(event.startswith(f"{victim} died (SIGKILL)") for event in events)
+    assert (f"{victim} hangs: no heartbeat for 5 s" in events) == (number == signal.SIGSTOP)
+    record = read_episode(tmp_path / "bag")
+    assert record.damage == ()
+    assert [step.stamp for step in record.steps] == [step.stamp for step in result.steps]
+    assert len(list((tmp_path / "bag").glob("*.mcap"))) == (2 if victim == "episode_recorder" else 1)
+
+
 def test_node_that_cannot_be_replaced_is_named(graphs):
     graph = processes_module.ProcessGraph(GraphDescription({"attention_policy": {}}, domain=fresh_domain()))
     with running(graph):

@@ -67,6 +67,8 @@ def _node(executable: str, given: dict[str, str]) -> Node:
         for name in [*entry.launch_parameters, "autostart", "use_sim_time"]
         if given[arguments.get(name, name)]
     }
+    if executable == "episode_recorder":
+        parameters["resume"] = True
     return Node(
         package=entry.package,
         executable=executable,

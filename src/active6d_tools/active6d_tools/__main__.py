@@ -1,5 +1,5 @@
 """``python -m active6d_tools`` is the ``active6d`` command."""
 
-from active6d_tools.cli import main
+from active6d_tools.command import main
 
 main()

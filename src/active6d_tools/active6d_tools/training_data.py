@@ -1,12 +1,12 @@
 """Training and validation views for the dense estimator: simulated and rendered, one file for each pile."""
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from concurrent.futures import as_completed
 from pathlib import Path
 
 import numpy as np
 
+from active6d_core.interrupts import worker_pool
 from active6d_core.object_model import load_object
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.training.samples import make_sample, write_shard
@@ -58,11 +58,7 @@ def render_missing(
     if missing:
         load_scene(object_name, "val", 0)  # says how to make the stored scenes if they are missing
         on_progress(0, len(missing))
-        # Threads do not survive a fork, and the ray caster and the network library have some.
-        with (
-            single_threaded(),
-            ProcessPoolExecutor(min(cores, len(missing)), mp_context=get_context("spawn")) as pool,
-        ):
+        with single_threaded(), worker_pool(min(cores, len(missing))) as pool:
             jobs = [pool.submit(tasks[path][0], *tasks[path][1]) for path in missing]
             for done, job in enumerate(as_completed(jobs), start=1):
                 job.result()

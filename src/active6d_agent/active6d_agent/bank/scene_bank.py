@@ -10,9 +10,8 @@ one compressed ``.npz`` per object and split, without pickled data. It holds:
 """
 
 import json
-import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 
 from active6d_core.camera import View
 from active6d_core.files import atomic_file, cache_folder
+from active6d_core.interrupts import worker_pool
 from active6d_core.metrics import MISSED_E_ADD, e_add
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
@@ -167,15 +167,11 @@ def build_bank(
     files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes if name not in known}
     missing = [name for name, file in files.items() if not _scenes_of(file, empty)]
     yield from (name for name in scenes if name not in missing)
-    # Spawned, because a forked child inherits locks of threads that do not exist in it (Embree, BLAS).
-    pool = ProcessPoolExecutor(max(1, min(workers, len(missing))), mp_context=multiprocessing.get_context("spawn"))
-    try:
+    with worker_pool(max(1, min(workers, len(missing)))) as pool:
         running = {pool.submit(_observe_to_file, observe, name, files[name], empty): name for name in missing}
         for done in as_completed(running):
             done.result()
             yield running[done]
-    finally:
-        pool.shutdown(cancel_futures=True)
     made = known | {name: load_bank(file).scenes[0] for name, file in files.items()}
     replace(empty, scenes=[made[name] for name in scenes]).save(path)
     for file in files.values():

@@ -1,13 +1,12 @@
 """How fast the environment is: steps per second of random actions with the deployed fusion."""
 
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from active6d_agent.environment.gym_environment import Active6DVectorEnv, make_spaces
+from active6d_core.interrupts import worker_pool
 
 
 def measure_steps_per_second(
@@ -25,7 +24,7 @@ def measure_steps_per_second(
         steps: moves T of an episode.
         seed: of scenes, starts and actions.
     """
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with worker_pool(workers) as pool:
         runs = [pool.submit(_run, bank, environments, seconds, steps, seed + worker) for worker in range(workers)]
         return float(sum(run.result() for run in runs))
 

@@ -1,7 +1,9 @@
 """Writing an episode as a rosbag2 folder: MCAP storage, schemas in the file, zstd chunks with checksums. No rclpy."""
 
 from contextlib import suppress
+from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
+from threading import RLock
 from typing import Any, BinaryIO, Literal
 from zlib import crc32
 
@@ -40,7 +42,7 @@ class EpisodeWriter:
         folder: must not exist unless ``resume``; its parents may.
         names: topic of the contract to the name it has in the bag (resolved against namespace and remaps).
         settings: the nodes' parameters as JSON, so that a replay can set the same.
-        resume: go on with the next file of a bag whose recorder was killed.
+        resume: go on with the next file of a bag in the folder whose recorder was killed.
 
     Raises:
         RecordingError: the folder exists, or cannot be made.
@@ -52,9 +54,10 @@ class EpisodeWriter:
         self._topics = {topic.name: topic for topic in CONTRACT}
         self._stamps: dict[str, set[int]] = {topic.name: set() for topic in CONTRACT}
         self._files: list[dict[str, Any]] = []
+        self._lock = RLock()
         self._writer: McapWriter
         self._stream: BinaryIO
-        if folder.exists() and not resume:
+        if folder.exists() and not (resume and _was_killed(folder)):
             raise RecordingError(f"{folder} exists already; name a new folder for the bag or remove this one")
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -78,12 +81,14 @@ class EpisodeWriter:
             RecordingError: the disk is full, or the folder is gone; what was written before stays readable.
         """
         message_type = self._topics[topic].type
+        content = clear_padding(message_type, payload)
+        published = received if published is None else published
         try:
-            content = clear_padding(message_type, payload)
-            self._writer.add_message(
-                self._channels[topic], received, content, received if published is None else published
-            )
-            self._writer.flush()
+            with self._lock:
+                if self._stream.closed:
+                    return  # by the thread that ends an interrupted process
+                self._writer.add_message(self._channels[topic], received, content, published)
+                self._writer.flush()
         except OSError as error:
             self._broken = True
             raise RecordingError(f"{self.folder} cannot be written: {error.strerror}; {self.summary()}") from error
@@ -105,6 +110,7 @@ class EpisodeWriter:
     def _open(self, path: Path) -> None:
         """Begin a file of the bag."""
         self._stream, self._broken = path.open("xb"), False
+        flock(self._stream, LOCK_EX | LOCK_NB)
         self._writer = McapWriter(self._stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._writer.start(profile="ros2", library="active6d")
         self._writer.add_metadata(ACTIVE6D, {SETTINGS: self._settings})
@@ -164,8 +170,16 @@ class EpisodeWriter:
         Raises:
             RecordingError: the disk is full; the messages that were written can be read all the same.
         """
-        if self._stream.closed:
+        # From another thread when an interrupted process is ended, which cannot wait for a disk that hangs.
+        if not self._lock.acquire(timeout=1.0):
             return
+        try:
+            if not self._stream.closed:
+                self._close()
+        finally:
+            self._lock.release()
+
+    def _close(self) -> None:
         text = yaml.safe_dump({INFORMATION: self._describe()}, sort_keys=False)
         try:
             if self._broken:
@@ -229,6 +243,20 @@ class EpisodeWriter:
             "custom_data": {SETTINGS: self._settings},
             "ros_distro": "jazzy",
         }
+
+
+def _was_killed(folder: Path) -> bool:
+    """Whether a folder holds a bag that has no metadata yet, and that no recorder is writing."""
+    paths = list(folder.glob("*.mcap"))
+    if not paths or (folder / "metadata.yaml").exists():
+        return False
+    for path in paths:
+        with path.open("rb") as file:
+            try:
+                flock(file, LOCK_EX | LOCK_NB)
+            except OSError:
+                return False
+    return True
 
 
 def file_number(path: Path) -> int:

@@ -2,10 +2,11 @@
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
+from threading import Event
 from typing import Any, Protocol
 
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
@@ -13,9 +14,14 @@ from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
+from active6d_core.interrupts import INTERRUPTS
 from active6d_core.ros.graph_nodes import NODES
 
 OnEvent = Callable[[str], None]
+
+
+class EpisodeInterrupted(KeyboardInterrupt):
+    """Somebody pressed Ctrl-C (or sent SIGTERM); the bag is closed and readable."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +96,21 @@ class ComposedGraph:
         ValueError: a parameter is wrong; the message names node and parameter.
     """
 
-    def __init__(self, description: GraphDescription, on_event: OnEvent = lambda text: None) -> None:
+    def __init__(
+        self,
+        description: GraphDescription,
+        on_event: OnEvent = lambda text: None,
+        interrupted: Event | None = None,
+    ) -> None:
         self._description = description
+        self._interrupted = interrupted or Event()
         self._on_event = on_event
         self.context = open_context(description)
         self.executor = EventsExecutor(context=self.context)
         self.nodes: dict[str, Node] = {}
         self.restarted: list[str] = []
         self._guests: list[Node] = []
+        self._closing = ExitStack()
 
     def add(self, node: Node) -> None:
         """Spin one more node of the caller's; it is destroyed with the graph."""
@@ -114,7 +127,11 @@ class ComposedGraph:
                 overrides=self._description.nodes[name],
             )
             self.executor.add_node(self.nodes[name])
+        if (recorder := self.nodes.get("episode_recorder")) is not None:
+            self._closing.enter_context(INTERRUPTS.before_end(recorder.close_bag))
         for name, node in self.nodes.items():
+            if self._interrupted.is_set():
+                raise EpisodeInterrupted
             self._on_event(f"starting {name}")
             node.start()
 
@@ -129,6 +146,7 @@ class ComposedGraph:
 
     def close(self) -> None:
         """Destroy all nodes."""
+        self._closing.close()
         for node in [*self._guests, *reversed(self.nodes.values())]:
             self.executor.remove_node(node)
             node.destroy_node()

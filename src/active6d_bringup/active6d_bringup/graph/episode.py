@@ -27,6 +27,7 @@ from active6d_bringup.graph.composition import (
     default_params_file,
     running,
 )
+from active6d_bringup.graph.composition import EpisodeInterrupted as EpisodeInterrupted
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
@@ -45,10 +46,6 @@ _SETTLE_SECONDS = 5.0
 
 class EpisodeError(RuntimeError):
     """An episode that did not come to its end; the text says which node has not answered."""
-
-
-class EpisodeInterrupted(KeyboardInterrupt):
-    """Interrupted by Ctrl-C or SIGTERM; the bag is closed and readable."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +171,7 @@ def run_episode(
         events.append(text)
         on_event(text)
 
-    with interruptible() as interrupted, running(make_graph(settings, describe(settings), note)) as graph:
+    with interruptible() as interrupted, running(make_graph(settings, describe(settings), note, interrupted)) as graph:
         monitor = EpisodeMonitor(graph.context, settings.namespace, on_step)
         graph.add(monitor)
         graph.start()
@@ -217,13 +214,20 @@ def describe(settings: EpisodeSettings) -> GraphDescription:
     return GraphDescription(nodes, settings.params_file or default_params_file(), settings.namespace, settings.domain)
 
 
-def make_graph(settings: Any, description: GraphDescription, on_event: OnEvent) -> Graph:
-    """The described graph, in this process or in one process a node as the settings say; not started yet."""
+def make_graph(settings: Any, description: GraphDescription, on_event: OnEvent, interrupted: threading.Event) -> Graph:
+    """The described graph, in this process or in one process a node as the settings say; not started yet.
+
+    Args:
+        settings: of an episode or a replay.
+        description: of the graph.
+        on_event: called with what happens to the nodes, in words.
+        interrupted: once it is set, the graph gives up starting.
+    """
     if settings.processes:
         from active6d_bringup.graph.processes import ProcessGraph
 
-        return ProcessGraph(description, on_event, settings.patience)
-    return ComposedGraph(description, on_event)
+        return ProcessGraph(description, on_event, settings.patience, interrupted)
+    return ComposedGraph(description, on_event, interrupted)
 
 
 @contextmanager

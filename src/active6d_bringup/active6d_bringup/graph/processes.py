@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from threading import Event
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
@@ -18,11 +19,15 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from active6d_bringup.graph.composition import GraphDescription, OnEvent, open_context
+from active6d_bringup.graph.composition import EpisodeInterrupted, GraphDescription, OnEvent, open_context
+from active6d_bringup.graph.liveness import HUNG_SECONDS, Pulses
+from active6d_core.interrupts import INTERRUPTS
 from active6d_core.ros.graph_nodes import BAD_PARAMETERS, MAX_RESTARTS, NODES
 from active6d_core.ros.node import connections
 
-_STOP_SECONDS = 15.0
+# Nodes have nothing to lose, and one that computes does not hear an interrupt. The recorder closes its bag.
+_STOP_SECONDS, _STOP_RECORDER_SECONDS = 1.5, 10.0
+_GRACE_SECONDS = 4.5
 
 
 class ProcessError(RuntimeError):
@@ -38,12 +43,20 @@ class ProcessGraph:
         description: of the graph.
         on_event: called with what happens to the nodes, in words.
         patience: seconds that a node has to come up, and again to set itself up.
+        interrupted: once it is set, starting is given up.
     """
 
     def __init__(
-        self, description: GraphDescription, on_event: OnEvent = lambda text: None, patience: float = 120.0
+        self,
+        description: GraphDescription,
+        on_event: OnEvent = lambda text: None,
+        patience: float = 120.0,
+        interrupted: Event | None = None,
     ) -> None:
         self._description = description
+        self._interrupted = interrupted or Event()
+        # The nodes are interrupted first, then the recorder, which must have heard them all.
+        INTERRUPTS.grace = _GRACE_SECONDS
         self._patience = patience
         self._on_event = on_event
         self.context = open_context(description)
@@ -56,6 +69,7 @@ class ProcessGraph:
         self.processes: dict[str, subprocess.Popen] = {}
         self.restarted: list[str] = []
         self._started = False
+        self._pulses = Pulses(self._node)
         self._complete = self._node.create_client(Trigger, "episode_recorder/complete")
         self._recorded: Any = None
 
@@ -92,6 +106,10 @@ class ProcessGraph:
         """
         self.executor.spin_once(timeout_sec=timeout)
         for name, process in list(self.processes.items()):
+            if process.poll() is None and self._started and self._pulses.stopped(name, process.pid):
+                self._on_event(f"{name} hangs: no heartbeat for {HUNG_SECONDS:.0f} s")
+                process.kill()
+                process.wait()
             if process.poll() is not None:
                 self._bury(name, process.returncode)
 
@@ -109,8 +127,8 @@ class ProcessGraph:
     def close(self) -> None:
         """Interrupt every process, the recorder last so that it sees all of them end; kill what does not listen."""
         recorder = self.processes.pop("episode_recorder", None)
-        for group in ([*self.processes.values()], [recorder] if recorder else []):
-            _end(group)
+        _end([*self.processes.values()], _STOP_SECONDS)
+        _end([recorder] if recorder else [], _STOP_RECORDER_SECONDS)
         for node in [*self._guests, self._node]:
             self.executor.remove_node(node)
             node.destroy_node()
@@ -120,6 +138,9 @@ class ProcessGraph:
     def _spawn(self, name: str, autostart: bool) -> None:
         description = self._description
         parameters = {**description.nodes[name], "autostart": autostart}
+        if name == "episode_recorder" and self._started:
+            parameters["resume"] = True
+        self._pulses.forget(name)
         command = [sys.executable, "-m", NODES[name].module, *description.ros_arguments()]
         if description.namespace:
             command += ["-r", f"__ns:=/{description.namespace.strip('/')}"]
@@ -145,6 +166,8 @@ class ProcessGraph:
     def _wait(self, predicate: Callable[[], bool], failure: str) -> None:
         deadline = time.monotonic() + self._patience
         while not predicate():
+            if self._interrupted.is_set():
+                raise EpisodeInterrupted
             if time.monotonic() > deadline:
                 raise ProcessError(f"{failure} within {self._patience:.0f} s")
             self.spin_once(0.05)
@@ -174,10 +197,10 @@ class ProcessGraph:
                 raise ProcessError(f"{name} could not start; see its own message above")
 
 
-def _end(processes: list[subprocess.Popen]) -> None:
+def _end(processes: list[subprocess.Popen], seconds: float) -> None:
     for process in processes:
         process.send_signal(signal.SIGINT)
-    deadline = time.monotonic() + _STOP_SECONDS
+    deadline = time.monotonic() + seconds
     for process in processes:
         try:
             process.wait(max(deadline - time.monotonic(), 0.1))

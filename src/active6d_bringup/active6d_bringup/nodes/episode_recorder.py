@@ -53,6 +53,10 @@ class EpisodeRecorderNode(GraphNode):
     def teardown(self) -> None:
         """Write what is still queued and close the bag."""
         self.drain()
+        self.close_bag()
+
+    def close_bag(self) -> None:
+        """Close the bag without what is still queued."""
         writer, self._writer = self._writer, None
         if writer is None:
             return

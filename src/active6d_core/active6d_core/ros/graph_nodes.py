@@ -30,7 +30,10 @@ class NodeEntry:
 
 #: Node name to entry. Their order is the order of starting: a subscriber comes before what it listens to.
 NODES = {
-    "episode_recorder": NodeEntry("active6d_bringup.nodes.episode_recorder", "EpisodeRecorderNode", ("bag",)),
+    # It goes on in the next file of its bag.
+    "episode_recorder": NodeEntry(
+        "active6d_bringup.nodes.episode_recorder", "EpisodeRecorderNode", ("bag",), restarted=True
+    ),
     "attention_policy": NodeEntry(
         "active6d_agent.nodes.attention_policy",
         "AttentionPolicyNode",

@@ -6,14 +6,14 @@ evaluations use the same heaps with every version of the physics engine.
 
 import os
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
 from active6d_core.files import atomic_file
+from active6d_core.interrupts import worker_pool
 from active6d_core.object_model import list_objects, load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.physics.heap import collision_file, simulate_heap
@@ -100,8 +100,7 @@ def generate(
     if not missing:
         return
     collision_file(load_object(object_name))  # once, so that not every process computes it
-    # A fork of a process in which the ray caster has started its threads would hang.
-    with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn")) as pool:
+    with worker_pool(workers or os.cpu_count() or 1) as pool:
         for done in as_completed([pool.submit(_store_scene, *job) for job in missing]):
             yield done.result()
 

@@ -8,6 +8,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
+from active6d_core.interrupts import INTERRUPTED
 from active6d_tools.cli import (
     ablate,
     bags,
@@ -45,6 +46,9 @@ class CommandGroup(TyperGroup):
             self._refuse(f"{error.format_message()} (see {context.command_path} --help)", error)
         except BrokenPipeError:
             raise
+        except KeyboardInterrupt:
+            typer.echo("active6d: interrupted", err=True)
+            raise typer.Exit(INTERRUPTED) from None
         # The packages raise these two for a wrong name, file or parameter; the message is one line.
         except (ValueError, OSError) as error:
             self._refuse(str(error), error)

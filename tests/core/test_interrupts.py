@@ -1,0 +1,92 @@
+"""Ctrl-C ends a command within seconds whatever it does, with exit code 130, and leaves no process behind."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+# A handler that does nothing stands for a library that swallows the exception.
+DEAF = """
+import signal, time
+from active6d_core.interrupts import INTERRUPTS
+INTERRUPTS.grace = 0.3
+INTERRUPTS.watch()
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda *arguments: None)
+with INTERRUPTS.before_end(lambda: print("closed", flush=True)):
+    print("ready", flush=True)
+    while True:
+        time.sleep(0.01)
+"""
+POOL = """
+import sys, time
+from active6d_core.interrupts import INTERRUPTS, worker_pool
+if __name__ == "__main__":
+    INTERRUPTS.grace = 0.3
+    INTERRUPTS.watch()
+    with worker_pool(2) as pool:
+        jobs = [pool.submit(time.sleep, 100) for _ in range(4)]
+        while not all(job.running() for job in jobs[:2]):
+            time.sleep(0.01)
+        print("ready", flush=True)
+        jobs[0].result()
+"""
+
+
+def start(script, *arguments):
+    process = subprocess.Popen([sys.executable, *arguments, script], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_does_not_end_is_ended(number):
+    process = start(DEAF, "-c")
+    process.send_signal(number)
+    began = time.monotonic()
+    assert process.wait(10) == 130
+    assert time.monotonic() - began < 2
+    assert process.stdout.read() == "closed\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_pool_ends_with_its_command(tmp_path, number):
+    (tmp_path / "pool.py").write_text(POOL)
+    process = start(str(tmp_path / "pool.py"))
+    workers = [child for child in psutil.Process(process.pid).children(recursive=True)]
+    assert len(workers) >= 2
+    process.send_signal(number)
+    process.wait(10)
+    busy = [worker for worker in workers if "spawn_main" in " ".join(cmdline(worker))]
+    assert not psutil.wait_procs(busy, timeout=5)[1]
+
+
+def cmdline(process):
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:
+        return []
+
+
+@pytest.mark.parametrize("delay", [0.15, 0.6])
+def test_ctrl_c_at_any_time_of_the_start_is_exit_code_130(delay):
+    command = [sys.executable, "-m", "active6d_tools", "episode", "--object", "mug", "--scene", "mug/test/0"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    while "command" not in modules(process.pid):
+        assert process.poll() is None
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    assert process.wait(20) == 130
+    assert time.monotonic() - began < 3
+    assert "Traceback" not in process.stderr.read()
+
+
+def modules(process):
+    """A word that says that the command's own handler is in place: it ignores neither signal by default."""
+    with open(f"/proc/{process}/status") as file:
+        caught = int(next(line for line in file if line.startswith("SigCgt")).split()[1], 16)
+    return "command" if caught >> (signal.SIGTERM - 1) & 1 else ""
