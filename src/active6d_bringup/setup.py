@@ -16,7 +16,10 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
-        *((f"share/{package}/{folder}", glob(f"{folder}/*")) for folder in ("launch", "config", "rviz", "foxglove")),
+        *(
+            (f"share/{package}/{folder}", glob(f"{folder}/*.*"))
+            for folder in ("launch", "config", "config/sros2", "rviz", "foxglove")
+        ),
     ],
     python_requires=">=3.11",
     install_requires=[

@@ -1,9 +1,9 @@
 """Which nodes make the graph, and how they run together in one process on one executor."""
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from threading import Event
@@ -16,6 +16,7 @@ from rclpy.node import Node
 
 from active6d_core.interrupts import INTERRUPTS
 from active6d_core.ros.graph_nodes import NODES
+from active6d_core.ros.network import DomainClaim, domain_of
 
 OnEvent = Callable[[str], None]
 
@@ -32,8 +33,8 @@ class GraphDescription:
         nodes: names in ``NODES``, each with the parameters that override the file's.
         params_file: ROS parameters YAML for all of them; None leaves the nodes' own defaults.
         namespace: of all topics and nodes.
-        domain: ROS domain; None takes ``ROS_DOMAIN_ID`` or, without it, one of this process's own, so that episodes
-            that run side by side do not talk to each other.
+        domain: ROS domain; None takes ``ROS_DOMAIN_ID`` or, without it, one that nobody is in, so that episodes that
+            run side by side do not talk to each other.
     """
 
     nodes: dict[str, dict[str, Any]]
@@ -59,11 +60,20 @@ class GraphDescription:
         return ["--ros-args", "--log-level", self.log_level, *parameters]
 
     def domain_id(self) -> int:
-        """The domain that the graph runs in."""
-        if self.domain is not None:
-            return self.domain
-        # DDS derives ports from the domain; those above 101 collide with the ones Linux hands out.
-        return int(os.environ.get("ROS_DOMAIN_ID") or 1 + os.getpid() % 101)
+        """The domain that the graph runs in; this process has it for this graph alone.
+
+        Raises:
+            DomainError: another command's graph is in it.
+        """
+        return self._claim.domain
+
+    @cached_property
+    def _claim(self) -> DomainClaim:
+        return DomainClaim(self.domain if self.domain is not None else domain_of(), self.namespace)
+
+    def release_domain(self) -> None:
+        """Let others have the domain."""
+        self._claim.release()
 
 
 class Graph(Protocol):
@@ -152,6 +162,7 @@ class ComposedGraph:
             node.destroy_node()
         self.executor.shutdown()
         self.context.try_shutdown()
+        self._description.release_domain()
 
 
 def load_node_type(name: str) -> type[Node]:

@@ -134,6 +134,7 @@ class ProcessGraph:
             node.destroy_node()
         self.executor.shutdown()
         self.context.try_shutdown()
+        self._description.release_domain()
 
     def _spawn(self, name: str, autostart: bool) -> None:
         description = self._description

@@ -25,6 +25,7 @@ from active6d_core.ros.adaptive_subscription import AdaptiveSubscription
 from active6d_core.ros.conversions import HARDWARE_ID, MessageError, OutdatedError, ns_to_stamp
 from active6d_core.ros.heartbeat import Awaited, Watch
 from active6d_core.ros.parameters import ParameterNode
+from active6d_core.ros.publishers import live_publishers
 from active6d_core.ros.topics import Topic
 
 _LOG_PERIOD_SECONDS = 5.0
@@ -121,7 +122,7 @@ class GraphNode(ParameterNode):
                 if subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
                     held.append(message)
                 return
-            self.guard(topic.name, partial(callback, message))
+            self.guard(topic.name, partial(self._take_from_one, topic, callback, message))
 
         def incompatible(event: Any) -> None:
             cause = self._watch.mismatch(topic.name, event.last_policy_kind)
@@ -145,6 +146,17 @@ class GraphNode(ParameterNode):
                 event_callbacks=events,
                 qos_overriding_options=_overridable(),
             )
+
+    def _take_from_one(self, topic: Topic, callback: Callable[[Any], None], message: Any) -> None:
+        """Hand a message on, unless nodes of several graphs publish the topic: nobody could say whose it is."""
+        if topic.publisher and self.count_publishers(topic.name) > 1:
+            names = live_publishers(self, topic.name)
+            if len(names) > 1:
+                raise MessageError(
+                    f"{len(names)} nodes publish it: {', '.join(names)}; stop all but one, or give each graph a "
+                    "ROS_DOMAIN_ID or a namespace of its own"
+                )
+        callback(message)
 
     def guard(self, topic: str, action: Callable[[], None]) -> None:
         """Do what input on a topic causes; a :class:`MessageError` is reported and nothing else."""

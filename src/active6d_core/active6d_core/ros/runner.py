@@ -9,6 +9,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.utilities import remove_ros_args
 
+from active6d_core.ros.network import describe_reach
 from active6d_core.ros.node import GraphNode
 
 _WAKE_SECONDS = 1.0
@@ -22,6 +23,7 @@ def run_node(node_type: Callable[[], GraphNode], args: Sequence[str] | None = No
     try:
         try:
             node = node_type()
+            node.get_logger().info(f"domain {node.context.get_domain_id()}, can be reached {describe_reach()}")
             if node.value("autostart"):
                 node.start()
         # Only here: a ValueError in a callback is a defect, which needs its traceback and the supervisor's restart.

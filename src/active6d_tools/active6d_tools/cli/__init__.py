@@ -2,13 +2,14 @@
 
 import os
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from active6d_core.interrupts import INTERRUPTED
+from active6d_core.ros.network import keep_on_this_machine
 from active6d_tools.cli import (
     ablate,
     bags,
@@ -52,13 +53,18 @@ class CommandGroup(TyperGroup):
         # The packages raise these two for a wrong name, file or parameter; the message is one line.
         except (ValueError, OSError) as error:
             self._refuse(str(error), error)
+        except typer.Exit:
+            raise
+        # Whatever else goes wrong is a defect, and a user gets one line for it as well.
+        except Exception as error:
+            self._refuse(f"internal error: {type(error).__name__}: {error} (active6d --debug shows where)", error, 1)
 
     @staticmethod
-    def _refuse(text: str, error: Exception) -> None:
+    def _refuse(text: str, error: Exception, code: int = 2) -> None:
         if os.environ.get("ACTIVE6D_TRACEBACK"):
             raise error
         typer.echo(f"active6d: {' '.join(text.split())}", err=True)
-        raise typer.Exit(2) from error
+        raise typer.Exit(code) from error
 
 
 class PartsCommand(TyperCommand):
@@ -88,13 +94,21 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     help="Estimate the 6D pose of every object in a bin; move the camera to the view that helps most.\n\n"
     "Example: [bold]active6d episode --object mug --seed 7 --policy lowest-score --bag bags/mug[/bold]",
-    epilog="ACTIVE6D_TRACEBACK=1 shows the full traceback of an error.",
+    epilog="active6d --debug COMMAND shows the full traceback of an error. --network lets other machines in.",
 )
 
 
 @app.callback()
-def show_help(ctx: typer.Context) -> None:
+def show_help(
+    ctx: typer.Context,
+    network: Annotated[bool, typer.Option("--network", help="Let other machines reach the nodes.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
     """Show the help if no command is given."""
+    if debug:
+        os.environ["ACTIVE6D_TRACEBACK"] = "1"
+    if not network:
+        keep_on_this_machine()
     if ctx.invoked_subcommand is None:
         typer.echo(ctx.get_help())
 
@@ -121,6 +135,4 @@ app.add_typer(train_estimator.app, name="train")
 
 def main() -> None:
     """Entry point of the ``active6d`` executable."""
-    # ROS discovery stays on this machine unless the user sets it, so that episodes of other machines do not mix.
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     sys.exit(app(prog_name="active6d"))
