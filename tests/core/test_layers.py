@@ -38,6 +38,7 @@ ROS_FOLDERS = {"ros", "nodes"}
 ON_ROS = {
     "active6d_bringup.bags.replay",
     "active6d_bringup.graph.composition",
+    "active6d_bringup.graph.liveness",
     "active6d_bringup.graph.episode",
     "active6d_bringup.graph.processes",
     "active6d_tools.benchmark.graph_overhead",
