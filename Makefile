@@ -1,6 +1,6 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo results check test lint clean
+.PHONY: help setup demo results check test battery lint clean
 
 BIN := .venv/bin
 DEMO := bags/demo
@@ -22,6 +22,9 @@ results: setup  ## what docs/results.md shows and is not measured yet, except tr
 
 test: setup  ## all tests
 	$(BIN)/python -m pytest tests
+
+battery: setup  ## attacks on stamps, messages, bags and views for 20 minutes
+	$(BIN)/python tests/battery.py --seconds 1200
 
 check: lint  ## what needs no run: lint, format, types, layers, links of the documentation
 	$(BIN)/mypy

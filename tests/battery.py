@@ -32,7 +32,7 @@ from active6d_perception.estimators.registry import create_estimator  # noqa: E4
 
 SECOND = 10**9
 FRAME = "camera_optical_frame"
-#: A view that takes longer counts as a failure.
+#: Seconds of processor time; a view that takes longer counts as a failure.
 SLOWEST_VIEW = 2.0
 Trial = Callable[[np.random.Generator], str]
 
@@ -118,9 +118,8 @@ def views() -> Iterator[Trial]:
     """Depth images that no scene shows, through the training-free estimator."""
     camera = PinholeCamera.from_field_of_view(160, 120, 60.0)
     estimator = create_estimator("geometric", load_object("mug"))
-    estimator.estimate(
-        View(1, np.zeros((120, 160, 3), np.uint8), np.full((120, 160), 0.8, np.float32), camera, np.eye(4))
-    )
+    color, noise = np.zeros((120, 160, 3), np.uint8), np.random.default_rng(0).uniform(0.5, 1.0, (120, 160))
+    estimator.estimate(View(1, color, noise.astype(np.float32), camera, np.eye(4)))  # compiles its loops
 
     def trial(rng: np.random.Generator) -> str:
         rows, columns = np.indices((120, 160))
@@ -135,9 +134,9 @@ def views() -> Iterator[Trial]:
         ]
         depth = kinds[rng.integers(len(kinds))].astype(np.float32)
         depth[rng.random(depth.shape) < rng.choice([0.0, 0.5, 0.999])] = np.nan
-        started = time.perf_counter()
-        estimator.estimate(View(1, np.zeros((*depth.shape, 3), np.uint8), depth, camera, np.eye(4)))
-        seconds = time.perf_counter() - started
+        started = time.process_time()
+        estimator.estimate(View(1, color, depth, camera, np.eye(4)))
+        seconds = time.process_time() - started
         return "" if seconds < SLOWEST_VIEW else f"{seconds:.1f} s"
 
     yield trial

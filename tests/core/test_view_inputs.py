@@ -250,6 +250,15 @@ def test_a_late_announcement_ends_only_what_came_before_its_view(follower):
     assert follower.views == [2 * SECOND, 3 * SECOND]
 
 
+def test_an_announcement_of_a_view_of_an_earlier_episode_changes_nothing(follower):
+    for stamp in (SECOND, 2 * SECOND):
+        follower.view(stamp)
+    for stamp in (2 * SECOND, SECOND):
+        follower.announce(stamp)
+    follower.view(3 * SECOND)
+    assert follower.views == [2 * SECOND, 3 * SECOND]
+
+
 def test_what_is_left_incomplete_is_counted_and_reported_once(graph, follower):
     diagnostics = graph.mailbox(DiagnosticArray, "/diagnostics")
     follower.info(SECOND)

@@ -59,6 +59,10 @@ class StampSynchronizer:
             oldest = next(iter(self._pending))
             self._on_loss(oldest, sorted(self._names - self._pending.pop(oldest).keys()))
 
+    def over(self, stamp: int) -> bool:
+        """Whether the set of this stamp was completed or ended."""
+        return stamp in self._over
+
     def end_before(self, stamp: int) -> None:
         """End the incomplete sets that began before the one of ``stamp``; all of them if that one has not begun."""
         for other in list(self._pending):

@@ -169,6 +169,8 @@ class ViewInputs:
             self._restart()
         else:
             self._views.end_before(start.stamp)
+            known = list(self._known)
+            self._known = {} if new else dict.fromkeys(known[known.index(start.stamp) :])
         if self._on_start is not None:
             self._on_start(start, new)
 
@@ -186,7 +188,7 @@ class ViewInputs:
             elif part == "pose":
                 check_camera_pose(value)
         if self._expected is not None and stamp == self._expected.stamp:
-            self._begin(self._expected, again=stamp in self._known)
+            self._begin(self._expected, again=self._views.over(stamp))
         try:
             self.add(part, stamp, value)
         except OutdatedError:
