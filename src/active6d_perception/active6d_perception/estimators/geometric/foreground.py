@@ -97,6 +97,8 @@ def find_large_planes(
         aligned = n @ n[draws].T > 0.9
         members = near & aligned
         best = members[:, members.sum(axis=0).argmax()]
+        if best.sum() < 20:
+            break
         for _ in range(3):
             centre = p[best].mean(axis=0)
             normal = np.linalg.svd(p[best] - centre, full_matrices=False)[2][2]
