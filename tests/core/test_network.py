@@ -19,8 +19,8 @@ from active6d_core.ros.network import (
     DomainError,
     describe_reach,
     domain_of,
+    is_used,
     keep_on_this_machine,
-    somebody_in,
 )
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.publishers import live_publishers
@@ -66,8 +66,8 @@ def test_what_the_user_set_is_kept_and_described():
     keep_on_this_machine(environment)
     assert environment["FASTRTPS_DEFAULT_PROFILES_FILE"] == "mine.xml"
     assert describe_reach(environment) == "as mine.xml says"
-    assert "whoever knows the address" in describe_reach({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
-    assert describe_reach({}) == "from the network by everybody"
+    assert "hosts that know the address" in describe_reach({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
+    assert describe_reach({}) == "from the network"
     assert "SROS 2" in describe_reach({"ROS_SECURITY_ENABLE": "true"})
 
 
@@ -88,13 +88,13 @@ def test_a_domain_has_one_graph_and_a_free_one_is_found(tmp_path, monkeypatch):
     DomainClaim(90).release()
     claims = [DomainClaim() for _ in range(5)]
     assert len({claim.domain for claim in claims}) == 5
-    assert not any(somebody_in(claim.domain) for claim in claims)
+    assert not any(is_used(claim.domain) for claim in claims)
     for claim in claims:
         claim.release()
 
 
 def test_a_domain_with_a_participant_of_somebody_else_is_not_free(graph):
-    assert somebody_in(graph.domain)
+    assert is_used(graph.domain)
 
 
 class Viewer(GraphNode):

@@ -32,7 +32,7 @@ def test_every_argument_has_a_description():
     descriptions = {name: entry.elts[2].value for name, entry in items("ARGUMENTS")}
     wanted = (
         "object policy seed scene steps metres estimator camera record bag rviz namespace params_file"
-        " autostart use_sim_time play rate"
+        " autostart use_sim_time play rate network"
     )
     assert set(descriptions) == set(wanted.split())
     assert all(len(description) > 10 for description in descriptions.values())

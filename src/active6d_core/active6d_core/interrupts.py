@@ -25,7 +25,7 @@ class Interrupts:
     registered with :meth:`before_end`, kills the child processes and ends the process with exit code 130.
 
     Attributes:
-        grace: seconds in which the command may end by itself.
+        grace: seconds that the command has to end.
         seen: set as soon as a signal has come.
     """
 

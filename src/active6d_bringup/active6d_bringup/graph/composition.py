@@ -22,7 +22,7 @@ OnEvent = Callable[[str], None]
 
 
 class EpisodeInterrupted(KeyboardInterrupt):
-    """Somebody pressed Ctrl-C (or sent SIGTERM); the bag is closed and readable."""
+    """Interrupted by Ctrl-C or SIGTERM; the bag is closed and readable."""
 
 
 @dataclass(frozen=True)

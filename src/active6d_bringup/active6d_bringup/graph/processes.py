@@ -25,7 +25,7 @@ from active6d_core.interrupts import INTERRUPTS
 from active6d_core.ros.graph_nodes import BAD_PARAMETERS, MAX_RESTARTS, NODES
 from active6d_core.ros.node import connections
 
-# Nodes have nothing to lose, and one that computes does not hear an interrupt. The recorder closes its bag.
+# Nodes have nothing to lose, and one that computes ignores an interrupt. The recorder closes its bag.
 _STOP_SECONDS, _STOP_RECORDER_SECONDS = 1.5, 10.0
 _GRACE_SECONDS = 4.5
 
@@ -55,7 +55,7 @@ class ProcessGraph:
     ) -> None:
         self._description = description
         self._interrupted = interrupted or Event()
-        # The nodes are interrupted first, then the recorder, which must have heard them all.
+        # The nodes are interrupted first, then the recorder, so that it records all of them.
         INTERRUPTS.grace = _GRACE_SECONDS
         self._patience = patience
         self._on_event = on_event

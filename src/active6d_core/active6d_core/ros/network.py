@@ -37,8 +37,8 @@ def describe_reach(environment: MutableMapping[str, str] = os.environ) -> str:
     if environment.get(PROFILES):
         return f"as {environment[PROFILES]} says"
     if environment.get(RANGE) == "LOCALHOST":
-        return f"from the network by whoever knows the address; {RANGE}=LOCALHOST limits discovery only"
-    return "from the network by everybody"
+        return f"from hosts that know the address; {RANGE}=LOCALHOST limits discovery only"
+    return "from the network"
 
 
 def domain_of(environment: MutableMapping[str, str] = os.environ) -> int | None:
@@ -61,7 +61,7 @@ class DomainClaim:
     Other commands of this project on this machine respect it. Other programs are noticed by the ports that they use.
 
     Args:
-        domain: the domain to claim, None for the first one that nobody is in.
+        domain: the domain to claim, None for the first free one.
         namespace: of the graph; graphs in several namespaces may share a domain that was named.
 
     Raises:
@@ -72,12 +72,12 @@ class DomainClaim:
         wanted = [domain] if domain is not None else _candidates()
         for each in wanted:
             self._file = _lock(each, namespace)
-            if self._file is not None and (domain is not None or not somebody_in(each)):
+            if self._file is not None and (domain is not None or not is_used(each)):
                 self.domain = each
                 return
             self.release()
         if domain is None:
-            raise DomainError(f"somebody is in each of the ROS domains 1 to {_LAST_DOMAIN}; end other graphs first")
+            raise DomainError(f"none of the ROS domains 1 to {_LAST_DOMAIN} is free; end other graphs first")
         where = f" in namespace {namespace}" if namespace else ""
         raise DomainError(
             f"another active6d command runs a graph in ROS domain {domain}{where}; wait for its end, or set another "
@@ -91,7 +91,7 @@ class DomainClaim:
             self._file = None
 
 
-def somebody_in(domain: int) -> bool:
+def is_used(domain: int) -> bool:
     """Whether a participant on this machine is in a domain: the first one has the first port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
