@@ -59,6 +59,12 @@ def test_what_is_no_model_is_refused(data):
         ScoreModel.from_dict(data, NAMES)
 
 
+def test_what_speaks_against_a_pose_never_speaks_for_it():
+    features, _, right = drawn()
+    model = ScoreModel.fit(NAMES, features * [1, -1], right, np.ones(len(right)), against=("violated",))
+    assert model.weights[1] == 0
+
+
 def test_one_kind_of_outcome_is_not_enough():
     features, _, right = drawn(20)
     with pytest.raises(ValueError, match="right and wrong"):

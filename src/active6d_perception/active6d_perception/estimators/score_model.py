@@ -38,7 +38,14 @@ class ScoreModel:
 
     @classmethod
     def fit(
-        cls, names: Sequence[str], features: np.ndarray, right: np.ndarray, weight: np.ndarray, penalty: float = 1e-3
+        cls,
+        names: Sequence[str],
+        features: np.ndarray,
+        right: np.ndarray,
+        weight: np.ndarray,
+        *,
+        against: Sequence[str] = (),
+        penalty: float = 1e-3,
     ) -> Self:
         """Fit by maximum likelihood with a small penalty on standardised weights.
 
@@ -47,6 +54,7 @@ class ScoreModel:
             features: (k, f) of poses.
             right: (k,) bool, whether each pose is right.
             weight: (k,) positive weight of each pose, so that several sources of poses count alike.
+            against: names of features that can only speak against a pose, whatever the data says.
             penalty: weight of the squared norm of the weights of standardised features.
 
         Raises:
@@ -65,7 +73,8 @@ class ScoreModel:
             gradient = -(share * sign * expit(-margin)) @ standardised + 2 * penalty * free
             return float(share @ np.logaddexp(0.0, -margin) + penalty * free @ free), gradient
 
-        found = minimize(loss, np.zeros(len(mean) + 1), jac=True, method="L-BFGS-B").x
+        bounds = [(None, 0.0 if name in against else None) for name in names] + [(None, None)]
+        found = minimize(loss, np.zeros(len(mean) + 1), jac=True, method="L-BFGS-B", bounds=bounds).x
         weights = found[:-1] / deviation
         return cls(tuple(names), weights, float(found[-1] - weights @ mean))
 

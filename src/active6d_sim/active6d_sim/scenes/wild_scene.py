@@ -55,6 +55,7 @@ def wild_pile(model: ObjectModel, seed: int) -> tuple[np.ndarray, Bin, Surroundi
     if container == "tote":
         around += _tote(bin, rng)
     around += _on_the_table(model, bin, table, rng) + _room(rng)
+    around += _far_clutter(model, np.random.default_rng([seed, 9]))
     partial = Scene(model.name, "partial", seed, T_objects, bin, np.zeros((0, len(T_objects))), surroundings=around)
     return T_objects, bin, around + _cables(SceneRenderer(partial, model=model, threads=1), bin, rng)
 
@@ -214,6 +215,18 @@ def _room(rng: np.random.Generator) -> Surroundings:
         plates.append(_plate(centre, size, Rotation.from_euler("z", rng.uniform(0, np.pi)).as_matrix()))
     room = _plates(plates, np.zeros(3))
     return _things(room.kind, room.size, room.T_world_thing, random_colors(rng, len(room)))
+
+
+def _far_clutter(model: ObjectModel, rng: np.random.Generator) -> Surroundings:
+    """Small things of all shapes behind the table, where depth is noisy: what stands on desks and shelves."""
+    count = int(rng.integers(0, 50))
+    things = _random_things(count, model.diameter, model.name, rng)
+    size = things.size * np.exp(rng.uniform(np.log(0.3), np.log(3.0), (count, 1)))
+    angle, distance = rng.uniform(0, 2 * np.pi, count), rng.uniform(1.3, 3.5, count)
+    T = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+    T[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix() if count else np.zeros((0, 3, 3))
+    T[:, :3, 3] = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), rng.uniform(-0.8, 0.5, count)])
+    return _things(things.kind, size, T, things.color)
 
 
 def _cables(renderer: SceneRenderer, bin: Bin, rng: np.random.Generator) -> Surroundings:

@@ -1,9 +1,10 @@
 """The training-free estimator, which needs only a mesh and a depth image."""
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from scipy.special import expit
 
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
@@ -21,6 +22,7 @@ from active6d_perception.estimators.geometric.multi_start import (
 from active6d_perception.estimators.geometric.pair_voting import PairVoting
 from active6d_perception.estimators.refinement import claim_pixels
 from active6d_perception.estimators.registry import register_estimator
+from active6d_perception.estimators.score_model import ScoreModel
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 
@@ -35,10 +37,12 @@ _MOST_POINTS = 8000
 _STARTS_PER_POINT = 24
 # A start that fits less than this, net of violations, is dropped.
 _LEAST_VALUE = 0.05
-# Logistic regression of whether a pose is right, on the features of :meth:`GeometricEstimator.candidates`, fitted by
-# active6d_tools.studies.fit_geometric_score on validation views.
-_SCORE_WEIGHTS = np.array([2.56, -0.36, 4.60, 1.36, -0.28])
-_SCORE_OFFSET = -1.59
+#: Features of :meth:`GeometricEstimator.candidates`.
+FEATURES = ("fitting", "violated", "fitting_unoccluded", "log_area", "area_share", "area_excess", "log_pixels")
+#: Those of them that can only speak against a pose.
+AGAINST = ("violated", "area_excess")
+#: The score's regression, fitted by active6d_tools.studies.fit_geometric_score on validation views of all objects.
+SCORE_FILE = Path(__file__).parent / "score.json"
 
 
 @dataclass(frozen=True)
@@ -54,8 +58,8 @@ class GeometricParameters:
         ValueError: a value is out of range.
     """
 
-    references: int = 300
-    refined: int = 600
+    references: int = 600
+    refined: int = 1000
     min_score: float = 0.1
 
     def __post_init__(self) -> None:
@@ -79,13 +83,14 @@ class GeometricEstimator:
         self._starts = Starts(self._views)
         self._distance = SymmetricDistance(model)
         self._samples = {count: samples_of(self._views, count) for count in (32, 64, 128, 256)}
+        self._score = ScoreModel.from_dict(json.loads(SCORE_FILE.read_text()), FEATURES)
         self._scale = float(np.clip(model.diameter / _REFERENCE_DIAMETER, *_SCALES))
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimators.registry.Estimator.estimate`."""
         surface = measure_surface(view.depth, view.camera, self.model.diameter)
         poses, label, features = self.candidates(surface)
-        score = expit(features @ _SCORE_WEIGHTS + _SCORE_OFFSET)
+        score = self._score.probability(features)
         reported = np.flatnonzero(score >= self.parameters.min_score)
         relabel = np.zeros(len(poses) + 1, np.uint16)
         relabel[reported + 1] = np.arange(1, len(reported) + 1)
@@ -98,9 +103,10 @@ class GeometricEstimator:
         """Poses that explain pixels which no better one explains.
 
         Returns:
-            (k, 4, 4) ``T_camera_object``; (H, W) uint16 label image, 1 + index of the pose and 0 for none; (k, 5)
-            features: fitting and violated shares, the fitting share of what is not occluded, the logarithm of the area
-            of its pixels over the diameter squared, and that area over the silhouette's part that is not occluded.
+            (k, 4, 4) ``T_camera_object``; (H, W) uint16 label image, 1 + index of the pose and 0 for none; (k, 7)
+            :data:`FEATURES`: fitting and violated shares, the fitting share of what is not occluded, the logarithm of
+            the area of its pixels over the diameter squared, that area over the silhouette's part that is not
+            occluded, up to 1 and beyond, and the logarithm of the number of its pixels.
         """
         image = image_of(surface)
         poses = self._propose(surface, image)
@@ -128,8 +134,17 @@ class GeometricEstimator:
         share = covered / self.model.diameter**2
         silhouette = self._silhouette_area(poses)
         unoccluded = np.maximum(1.0 - shares[:, 2], 0.1)
+        area_share = covered / (silhouette * unoccluded)
         features = np.column_stack(
-            [shares[:, 0], shares[:, 1], shares[:, 0] / unoccluded, np.log(share), covered / (silhouette * unoccluded)]
+            [
+                shares[:, 0],
+                shares[:, 1],
+                shares[:, 0] / unoccluded,
+                np.log(share),
+                np.minimum(area_share, 1.0),
+                np.maximum(area_share - 1.0, 0.0),
+                np.log(pixels[claimed]),
+            ]
         )
         return poses, relabel[label], features
 

@@ -1,0 +1,86 @@
+"""Fitting of an estimator's score: what it says of poses in validation views, and whether they are right."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from active6d_core.camera import View
+from active6d_core.metrics import DETECTION_FRACTION, add_s, e_add, match
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import invert
+from active6d_core.view_sphere import ViewSphere
+from active6d_sim.scenes.scene_store import SPLITS, load_scene
+from active6d_tools.benchmark.grid_views import GridViews
+from active6d_tools.training_data import VALIDATION_SPLITS
+
+#: From a view to (k, 4, 4) ``T_camera_object`` and their (k, f) features.
+Judge = Callable[[View], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedPoses:
+    """k poses of validation views.
+
+    Attributes:
+        features: (k, f) as the estimator computes them.
+        right: (k,) bool, whether each is the best match of a true object, within 10 % of the diameter. An object with a
+            part that can be hidden counts by ADD-S, as no view may show how it is turned.
+        split: (k,) index into :data:`.VALIDATION_SPLITS`.
+        group: (k,) number of the scene.
+    """
+
+    features: np.ndarray
+    right: np.ndarray
+    split: np.ndarray
+    group: np.ndarray
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(k,) weights with which every split counts alike."""
+        return np.asarray(1.0 / np.bincount(self.split, minlength=len(VALIDATION_SPLITS))[self.split])
+
+
+def judge_validation_views(
+    model: ObjectModel,
+    judge: Judge,
+    views: int,
+    rng: np.random.Generator,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> JudgedPoses:
+    """Run an estimator on random views of the nominal and the wild validation scenes.
+
+    Args:
+        model: the object.
+        judge: the estimator's poses and features.
+        views: number of views of each scene.
+        rng: random generator of the views.
+        on_progress: called with the number of scenes done and of all scenes.
+    """
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+    total = sum(SPLITS[split] for split in VALIDATION_SPLITS)
+    done = 0
+    for number, split in enumerate(VALIDATION_SPLITS):
+        scenes = [load_scene(model.name, split, index) for index in range(SPLITS[split])]
+        grid = GridViews(model, scenes, seed=0)
+        for index in range(len(scenes)):
+            for view in rng.choice(len(ViewSphere()), views, replace=False):
+                labelled = grid.capture(index, int(view), 1.0)
+                T, features = judge(labelled.view)
+                right = is_right(model, T, invert(labelled.view.T_world_camera) @ labelled.T_world_object)
+                parts.append((features, right, np.full(len(T), number), np.full(len(T), done)))
+            done += 1
+            on_progress(done, total)
+    return JudgedPoses(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def is_right(model: ObjectModel, T_camera_object: np.ndarray, T_camera_true: np.ndarray) -> np.ndarray:
+    """(k,) whether each of (k, 4, 4) poses is the match of one of (n, 4, 4) true ones; see :class:`JudgedPoses`."""
+    limit = DETECTION_FRACTION * model.diameter
+    errors = np.full((len(T_camera_object), len(T_camera_true)), np.inf)
+    apart = np.linalg.norm(T_camera_object[:, None, :3, 3] - T_camera_true[None, :, :3, 3], axis=-1)
+    measure = add_s if model.features else e_add
+    for pose, other in zip(*np.nonzero(apart < 0.5 * model.diameter), strict=True):
+        errors[pose, other] = measure(model, T_camera_object[pose], T_camera_true[other])
+    matched = match(errors, limit)
+    return np.isin(np.arange(len(T_camera_object)), matched[matched >= 0])
