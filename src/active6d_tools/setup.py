@@ -32,7 +32,6 @@ setup(
         "rosbags",
         "scipy",
         "torch",
-        "trimesh",
         "typer",
     ],
     entry_points={"console_scripts": ["active6d = active6d_tools.command:main"]},
