@@ -103,10 +103,9 @@ class GeometricEstimator:
         """Poses that explain pixels which no better one explains.
 
         Returns:
-            (k, 4, 4) ``T_camera_object``; (H, W) uint16 label image, 1 + index of the pose and 0 for none; (k, 7)
-            :data:`FEATURES`: fitting and violated shares, the fitting share of what is not occluded, the logarithm of
-            the area of its pixels over the diameter squared, that area over the silhouette's part that is not
-            occluded, up to 1 and beyond, and the logarithm of the number of its pixels.
+            (k, 4, 4) ``T_camera_object``; (H, W) uint16 label image, 1 + index of the pose and 0 for none; and (k, 7)
+            :data:`FEATURES`. Fitting shares are of all samples, and of what is not occluded. The area of the pose's
+            pixels is given over the diameter squared, and over the silhouette's part that is not occluded.
         """
         image = image_of(surface)
         poses = self._propose(surface, image)
