@@ -54,7 +54,7 @@ class ScoreModel:
             features: (k, f) of poses.
             right: (k,) bool, whether each pose is right.
             weight: (k,) positive weight of each pose, so that several sources of poses count alike.
-            against: names of features that can only speak against a pose, whatever the data says.
+            against: names of features that can only lower the score, whatever the data says.
             penalty: weight of the squared norm of the weights of standardised features.
 
         Raises:

@@ -39,7 +39,7 @@ _STARTS_PER_POINT = 24
 _LEAST_VALUE = 0.05
 #: Features of :meth:`GeometricEstimator.candidates`.
 FEATURES = ("fitting", "violated", "fitting_unoccluded", "log_area", "area_share", "area_excess", "log_pixels")
-#: Those of them that can only speak against a pose.
+#: Features that can only lower the score.
 AGAINST = ("violated", "area_excess")
 #: The score's regression, fitted by active6d_tools.studies.fit_geometric_score on validation views of all objects.
 SCORE_FILE = Path(__file__).parent / "score.json"
