@@ -78,7 +78,7 @@ def test_without_a_command_the_help_is_shown():
         (["replay", "/nowhere", "--rate", "2", "--as-fast"], "exclude each other"),
         (["replay", "/nowhere", "--rate", "0"], "--rate"),
         (["report", "/nowhere"], "/nowhere: no such folder"),
-        (["report"], "Missing argument 'DIR'"),
+        (["report"], "Missing argument 'BAG'"),
         (["object", "show", "teapot"], "unknown object 'teapot'"),
         (["object", "add", "/nowhere.ply", "--name", "x"], "mesh /nowhere.ply does not exist"),
         (["object", "add", "/nowhere.ply", "--name", "../x"], "--name '../x'"),

@@ -180,11 +180,11 @@ class CameraAdapterNode(GraphNode):
                 self.get_logger().warning(f"goal refused: {reason}")
 
     def _photograph(self, stamp: int, color: Any, depth: Any, T_world_camera: np.ndarray) -> None:
-        if stamp <= self._last_stamp:
+        if stamp <= self._last_stamp and not self._begins:
             self._gate.waiting = True
             raise MessageError(
                 f"stamp {stamp * 1e-9:.3f} s is not after the last view's {self._last_stamp * 1e-9:.3f} s; "
-                "if the driver was restarted, restart this graph"
+                "if the driver was restarted, call ~/reset"
             )
         if "info" not in self._infos:
             self._gate.waiting = True
