@@ -30,7 +30,7 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
-        self.grace = 1.5
+        self.grace = 1.0
         self.seen = threading.Event()
         self._last: list[Callable[[], None]] = []
 
