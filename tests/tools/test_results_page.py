@@ -153,7 +153,7 @@ def test_goals_are_met_or_not(evaluated):
     answers = [cells[0].split(":")[0] for cells in told.values()]
     assert answers == [
         "met",  # more than every baseline
-        "met",  # lower e_ADD
+        "met",  # lower ADD
         "met",  # no farther than Random
         "**not met**",  # half of the gap
         "met",  # 5 like 10
@@ -165,8 +165,8 @@ def test_goals_are_met_or_not(evaluated):
         "met",
         "**not met**",  # 6 ms
     ]
-    assert told["Its learned attention beats the lowest score (the paper: +3 % found, -9 % e_ADD)"][0] == (
-        f"met: +.020 found, e_ADD {-200 / lowest['e_add_mm'].mean():+.0f} %"
+    assert told["Its learned attention beats the lowest score (the paper: +3 % found, -9 % ADD)"][0] == (
+        f"met: +.020 found, ADD {-200 / lowest['e_add_mm'].mean():+.0f} %"
     )
 
 
