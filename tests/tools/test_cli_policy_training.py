@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from active6d_agent.bank.scene_bank import bank_path
-from active6d_tools.benchmark import environment_speed as environment
+from active6d_agent.environment import throughput
 from active6d_tools.benchmark import pipeline
 from active6d_tools.cli import app
 
@@ -81,7 +81,7 @@ def test_the_environments_speed_is_that_of_all_processes(banks, tmp_path, monkey
         asked.update(keywords, bank=bank)
         return 12345.0
 
-    monkeypatch.setattr(environment, "measure_steps_per_second", measure)
+    monkeypatch.setattr(throughput, "measure_steps_per_second", measure)
     result = run(
         "benchmark", "environment", "--banks", str(banks), "--workers", "3", "--json", str(tmp_path / "x.json")
     )

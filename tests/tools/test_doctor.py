@@ -5,9 +5,9 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from active6d_tools import doctor
+from active6d_tools import machine_doctor
 from active6d_tools.cli import app
-from active6d_tools.doctor import Check, works
+from active6d_tools.machine_doctor import Check, works
 
 
 def test_this_machine_is_well(tmp_path):
@@ -28,7 +28,7 @@ def test_this_machine_is_well(tmp_path):
 
 def test_a_missing_needed_library_is_exit_code_1(monkeypatch, tmp_path):
     broken = [Check("A", "spoon", True, True, "1.0"), Check("A", "fork", False, True, "not there", "buy a fork")]
-    monkeypatch.setattr(doctor, "examine", lambda: iter(broken))
+    monkeypatch.setattr(machine_doctor, "examine", lambda: iter(broken))
     result = CliRunner().invoke(app, ["doctor", "--json", str(tmp_path / "doctor.json")])
     assert result.exit_code == 1
     assert "buy a fork" in result.stdout
@@ -44,5 +44,5 @@ def test_only_what_is_needed_counts(needed, expected):
 def test_a_library_that_breaks_while_loading_is_a_finding(tmp_path, monkeypatch):
     (tmp_path / "brittle_library.py").write_text("raise OSError('libusb-1.0.so.0: cannot open\\nmore')\n")
     monkeypatch.syspath_prepend(tmp_path)
-    check = doctor._import_check("A", "brittle_library", "brittle", needed=True, fix="fix it")
+    check = machine_doctor._import_check("A", "brittle_library", "brittle", needed=True, fix="fix it")
     assert (check.ok, check.detail, check.fix) == (False, "libusb-1.0.so.0: cannot open", "fix it")

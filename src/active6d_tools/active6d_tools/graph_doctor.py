@@ -15,7 +15,7 @@ from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, Reliabilit
 
 from active6d_core.ros.conversions import HARDWARE_ID
 from active6d_core.ros.topics import CONTRACT
-from active6d_tools.doctor import Check
+from active6d_tools.machine_doctor import Check
 
 _NAME = "active6d_doctor"
 _DIAGNOSTICS = "/diagnostics"

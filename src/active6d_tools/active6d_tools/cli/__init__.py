@@ -15,7 +15,6 @@ from active6d_tools.cli import (
     bags,
     bank,
     benchmark,
-    benchmark_agent,
     benchmark_estimator,
     doctor,
     episode,
@@ -125,9 +124,8 @@ app.command("list")(list_parts.list_parts)
 app.add_typer(bags.app, name="bag")
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
-benchmark.app.command()(benchmark_estimator.estimator)
-benchmark.app.command()(benchmark_agent.environment)
-benchmark.app.command(cls=PartsCommand)(benchmark_agent.pipeline)
+benchmark.app.command(cls=PartsCommand)(benchmark_estimator.estimator)
+benchmark.app.command(cls=PartsCommand)(benchmark.pipeline)
 app.add_typer(benchmark.app, name="benchmark")
 train_estimator.app.command()(train_policy.policy)
 app.add_typer(train_estimator.app, name="train")

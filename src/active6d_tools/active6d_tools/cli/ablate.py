@@ -21,7 +21,7 @@ from active6d_tools.cli.options import (
 )
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.progress import collect_rows, follow_training
-from active6d_tools.cli.terminal import console, messages, progress_bar
+from active6d_tools.cli.terminal import messages, print_table, progress_bar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -200,13 +200,7 @@ def _train_seeds(
 
 
 def _print(rows: list[dict], title: str) -> None:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, title=title)
     hidden = ("against_first", "parameter", "value", "policy", "training_seed", "noise")
     columns = [key for key in rows[0] if "_ci95" not in key and key not in hidden]
-    for column in columns:
-        table.add_column(column.replace("_", " "), justify="left" if column == "variant" else "right")
-    for row in rows:
-        table.add_row(*(f"{row[key]:.3f}" if isinstance(row[key], float) else str(row[key]) for key in columns))
-    console.print(table)
+    cells = [[f"{row[key]:.3f}" if isinstance(row[key], float) else str(row[key]) for key in columns] for row in rows]
+    print_table([column.replace("_", " ") for column in columns], cells, title=title)

@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from active6d_tools.cli.options import JsonFile, ObjectName, Seed, SensorName, Split
 from active6d_tools.cli.output import write_json
-from active6d_tools.cli.terminal import console, messages, progress_bar
+from active6d_tools.cli.terminal import console, messages, print_table, work_progress
 
 if TYPE_CHECKING:
     from active6d_core.object_model import ObjectModel
@@ -63,8 +62,7 @@ def estimator(
         split = f"wild_{split}"
     # The dense estimator needs weights of the object.
     able = [name for name in list_estimators() if name != "dense" or weights or weights_path(object_name).is_file()]
-    with progress_bar() as progress:
-        task = progress.add_task("loading", total=None)
+    with work_progress() as on_progress:
         contenders = enlist(model, names or able, weights=weights or [], peers=peers)
         measured = measure_estimators(
             object_name,
@@ -76,7 +74,7 @@ def estimator(
             noises=tuple(dict.fromkeys(noise or [1.0])),
             sensor=sensor,
             records=records,
-            on_progress=lambda what, done, total: progress.update(task, description=what, completed=done, total=total),
+            on_progress=on_progress,
         )
     _print(measured, f"{object_name}, {split}", " or ".join(model.features))
     write_json(json_file, measured.document)
@@ -86,12 +84,8 @@ def estimator(
 
 def _print(measured: "Measurement", title: str, part: str) -> None:
     for factor, rows in measured.document["noise"].items():
-        for table in (
-            _rates(f"{title}, {measured.document['views']} views, noise x{factor}", rows, part),
-            _details(rows, part),
-        ):
-            console.print(table)
-            console.print()
+        _print_rates(f"{title}, {measured.document['views']} views, noise x{factor}", rows, part)
+        _print_details(rows, part)
     console.print(f"peak memory of this process: {measured.document['peak_memory_mib']:.0f} MiB", highlight=False)
 
 
@@ -107,38 +101,33 @@ def _draw(folder: Path, model: "ObjectModel", title: str, measured: "Measurement
         messages.print(f"wrote {folder}/*_{ending}", highlight=False)
 
 
-def _rates(title: str, rows: dict[str, dict[str, Any]], part: str) -> Table:
+def _print_rates(title: str, rows: dict[str, dict[str, Any]], part: str) -> None:
     """Detection rates by visible fraction and precision, with 95 % intervals; ``part`` breaks the symmetry."""
-    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    table.add_column("detection at 10 %", header_style="dim", no_wrap=True)
-    for column in ("ADD ≥half", "≥tenth", "ADD-S ≥half", "≥tenth", "precision"):
-        table.add_column(column, justify="right", header_style="dim")
+    table = []
     for name, row in rows.items():
-        cells = [_interval(row[kind][least]) for kind in ("add", "adds") for least in ("0.5", "0.1")]
-        table.add_row(name, *cells, _interval(row["precision"]))
-        if "feature_seen" in row:
-            seen = row["feature_seen"]
-            cells = [_interval(seen[kind][least]) for kind in ("add", "adds") for least in ("0.5", "0.1")]
-            table.add_row(f"  {part} seen", *cells, "")
-    return table
+        for label, rates in ((name, row), (f"  {part} seen", row.get("feature_seen"))):
+            if rates:
+                cells = [_interval(rates[kind][least]) for kind in ("add", "adds") for least in ("0.5", "0.1")]
+                table.append([label, *cells, _interval(row["precision"]) if rates is row else ""])
+    columns = ("detection at 10 %", "ADD ≥half", "≥tenth", "ADD-S ≥half", "≥tenth", "precision")
+    print_table(columns, table, title=title)
+    console.print()
 
 
 #: Label, what is shown of a value, and the nested keys of the value.
 Detail = tuple[str, Callable[[Any], str], tuple[str, ...]]
 
 
-def _details(rows: dict[str, dict[str, Any]], part: str) -> Table:
+def _print_details(rows: dict[str, dict[str, Any]], part: str) -> None:
     """BOP's recalls and precisions, quality of the scores, times; one column per estimator, "-" where it has none."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("", no_wrap=True)
-    for name in rows:
-        table.add_column(name, justify="right", header_style="dim")
+    table = []
     for label, show, keys in (*_quality(rows, part), *_times(rows)):
         found: list[Any] = list(rows.values())
         for key in keys:
             found = [value.get(key) if value else None for value in found]
-        table.add_row(label, *("-" if value is None else show(value) for value in found))
-    return table
+        table.append([label, *("-" if value is None else show(value) for value in found)])
+    print_table(("", *rows), table)
+    console.print()
 
 
 def _quality(rows: dict[str, dict[str, Any]], part: str) -> Iterator[Detail]:

@@ -5,13 +5,15 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
+from rich.table import Table
 
 from active6d_tools.cli.options import JsonFile
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.terminal import console, messages
 
 if TYPE_CHECKING:
-    from active6d_tools.doctor import Check
+    from active6d_tools.machine_doctor import Check
 
 
 def doctor(
@@ -30,7 +32,7 @@ def doctor(
 
     Example: [bold]active6d doctor --json doctor.json[/bold] or [bold]active6d doctor --graph --domain 7[/bold]
     """
-    from active6d_tools.doctor import examine, works
+    from active6d_tools.machine_doctor import examine, works
 
     if not graph and (domain is not None or namespace):
         raise ValueError("--domain and --namespace need --graph")
@@ -48,8 +50,6 @@ def doctor(
 
 
 def _collect(found: "Iterable[Check]") -> "list[Check]":
-    from rich.markup import escape
-
     checks = []
     with messages.status("looking") as status:
         for check in found:
@@ -59,9 +59,6 @@ def _collect(found: "Iterable[Check]") -> "list[Check]":
 
 
 def _print(checks: "list[Check]") -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(width=1)
     table.add_column(no_wrap=True)
@@ -79,8 +76,6 @@ def _print(checks: "list[Check]") -> None:
 
 
 def _print_verdict(checks: "list[Check]", subject: str) -> None:
-    from rich.markup import escape
-
     missing = ", ".join(check.name for check in checks if check.needed and not check.ok)
     if missing:
         console.print(f"[red]The {subject} does not work: {escape(missing)}.[/red]")

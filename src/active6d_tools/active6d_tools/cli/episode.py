@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from active6d_tools.cli.options import (
     Imports,
@@ -17,7 +18,7 @@ from active6d_tools.cli.options import (
     parse_overrides,
 )
 from active6d_tools.cli.output import write_json, write_reports
-from active6d_tools.cli.terminal import console, messages, progress_bar
+from active6d_tools.cli.terminal import messages, print_table, progress_bar
 
 if TYPE_CHECKING:
     from active6d_bringup.graph.episode import EpisodeResult, EpisodeSettings, EpisodeStep
@@ -116,8 +117,6 @@ def _check_names(settings: "EpisodeSettings") -> None:
 
 def _run(settings: "EpisodeSettings") -> "EpisodeResult":
     """Run with one line per view and a progress bar; a failed episode gives one line and exit code 1."""
-    from rich.markup import escape
-
     from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, run_episode
     from active6d_bringup.graph.processes import ProcessError
 
@@ -195,23 +194,15 @@ def _summary(result: "EpisodeResult") -> dict[str, Any]:
 
 
 def _print_summary(result: "EpisodeResult", summary: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_column(style="dim")
-    table.add_column()
     moves = f"{summary['moves']} moves, {result.distance:.2f} m, {result.seconds:.1f} s"
-    table.add_row("episode", escape(f"{summary['scene'] or result.settings.object}, {summary['policy']}: {moves}"))
-    table.add_row("ended", escape(result.reason))
+    rows = [("episode", f"{summary['scene'] or result.settings.object}, {summary['policy']}: {moves}")]
+    rows.append(("ended", result.reason))
     if summary["objects_true"] is None:
-        table.add_row("objects", str(len(result.objects)))
+        rows.append(("objects", str(len(result.objects))))
     else:
         found = f"{summary['detection_rate'] * summary['objects_true']:.0f} of {summary['objects_true']}"
-        table.add_row("found", f"{found} ({summary['detection_rate']:.0%}), mean ADD {summary['e_add_mm']:.1f} mm")
-    for event in result.events:
-        if not event.startswith("starting "):
-            table.add_row("event", escape(event))
+        rows.append(("found", f"{found} ({summary['detection_rate']:.0%}), mean ADD {summary['e_add_mm']:.1f} mm"))
+    rows += [("event", event) for event in result.events if not event.startswith("starting ")]
     if result.settings.bag is not None:
-        table.add_row("bag", escape(str(result.settings.bag)))
-    console.print(table)
+        rows.append(("bag", str(result.settings.bag)))
+    print_table(("", ""), rows, left=2)

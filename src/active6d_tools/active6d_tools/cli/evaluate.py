@@ -1,6 +1,6 @@
 """``active6d evaluate``: policies on a scene bank, as in the paper's Table 1."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -17,10 +17,7 @@ from active6d_tools.cli.options import (
     usable_policies,
 )
 from active6d_tools.cli.output import write_json
-from active6d_tools.cli.terminal import console, messages, progress_bar
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from active6d_tools.cli.terminal import messages, print_table, progress_bar
 
 #: A second table compares this policy with the others.
 _DEFAULT = "view-attention"
@@ -70,48 +67,33 @@ def evaluate(
         running = run_all(lookup, names, steps, starts, seed=seed, parameters=parameters, on_progress=on_progress)
         results = dict(running)
     summary = summarise(results, object_name, steps, seed)
-    console.print(_table(summary))
+    _print_policies(summary)
     if _DEFAULT in results and len(results) > 1:
-        console.print(_differences(summary))
+        _print_differences(summary)
     provenance = {"split": split, "seed": seed, "bank": bank.provenance, "parameters": parameters}
     write_json(json_file, {**summary, **provenance})
 
 
-def _table(summary: dict[str, Any]) -> "Table":
-    from rich.table import Table
-
-    title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
-    table = Table(box=None, pad_edge=False, title=title)
-    table.add_column("policy", header_style="dim", no_wrap=True, min_width=max(map(len, summary["policies"])))
-    for column in ("d, m", "ADD, mm", "", "detected", "", "gap closed"):
-        table.add_column(column, justify="right", header_style="dim")
+def _print_policies(summary: dict[str, Any]) -> None:
+    rows = []
     for name, row in summary["policies"].items():
-        error, rate, gap = row["e_add_mm_ci95_scenes"], row["detection_rate_ci95_scenes"], row["gap_closed"]
-        table.add_row(
-            name,
-            f"{row['distance_m']:.2f}",
-            f"{row['e_add_mm']:.2f}",
-            f"[dim]{error[0]:.2f}-{error[1]:.2f}[/dim]",
-            f"{row['detection_rate']:.3f}",
-            f"[dim]{rate[0]:.3f}-{rate[1]:.3f}[/dim]",
-            "-" if gap is None else f"{gap:.0%}",
-        )
-    return table
+        cells = [name, f"{row['distance_m']:.2f}"]
+        for key, digits in (("e_add_mm", 2), ("detection_rate", 3)):
+            low, high = row[f"{key}_ci95_scenes"]
+            cells += [f"{row[key]:.{digits}f}", f"[dim]{low:.{digits}f}-{high:.{digits}f}[/dim]"]
+        rows.append([*cells, "-" if row["gap_closed"] is None else f"{row['gap_closed']:.0%}"])
+    title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
+    print_table(("policy", "distance, m", "ADD, mm", "", "detected", "", "gap closed"), rows, title=title)
 
 
-def _differences(summary: dict[str, Any]) -> "Table":
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, title=f"{_DEFAULT} minus the others, from the same starts")
-    against = summary["policies"][_DEFAULT]["against"]
-    table.add_column("against", header_style="dim", no_wrap=True, min_width=max(map(len, against)))
-    for column in ("d, m", "ADD, mm", "", "detected", ""):
-        table.add_column(column, justify="right", header_style="dim")
-    for name, measured in against.items():
-        cells = [f"{measured['distance_m']['mean']:+.2f}"]
+def _print_differences(summary: dict[str, Any]) -> None:
+    rows = []
+    for name, measured in summary["policies"][_DEFAULT]["against"].items():
+        cells = [name, f"{measured['distance_m']['mean']:+.2f}"]
         for key, digits in (("e_add_mm", 2), ("detection_rate", 3)):
             low, high = (f"{end:+.{digits}f}" for end in measured[key]["ci95_scenes"])
             style = "bold" if measured[key]["excludes_zero_scenes"] else "dim"
             cells += [f"[{style}]{measured[key]['mean']:+.{digits}f}[/]", f"[dim]{low} {high}[/dim]"]
-        table.add_row(name, *cells)
-    return table
+        rows.append(cells)
+    title = f"{_DEFAULT} minus the others, from the same starts"
+    print_table(("against", "distance, m", "ADD, mm", "", "detected", ""), rows, title=title)

@@ -2,7 +2,7 @@
 
 from active6d_tools.cli.options import Imports, JsonFile
 from active6d_tools.cli.output import write_json
-from active6d_tools.cli.terminal import console
+from active6d_tools.cli.terminal import print_table
 
 
 def list_parts(imports: Imports = None, json_file: JsonFile = None) -> None:
@@ -14,19 +14,11 @@ def list_parts(imports: Imports = None, json_file: JsonFile = None) -> None:
 
     Example: [bold]active6d list --import my.module[/bold]
     """
-    from rich.markup import escape
-    from rich.table import Table
-
     from active6d_agent.policies.registry import policy_origins
     from active6d_perception.estimators.registry import estimator_origins
     from active6d_sim.rendering.sensor_registry import sensor_origins
 
     found = {"estimator": estimator_origins(), "policy": policy_origins(), "sensor": sensor_origins()}
-    table = Table(box=None, pad_edge=False)
-    for column in ("kind", "name", "origin"):
-        table.add_column(column, header_style="dim", no_wrap=True)
-    for kind, origins in found.items():
-        for name, origin in sorted(origins.items()):
-            table.add_row(kind, escape(name), escape(origin))
-    console.print(table)
+    rows = [(kind, *part) for kind, origins in found.items() for part in sorted(origins.items())]
+    print_table(("kind", "name", "origin"), rows, left=3)
     write_json(json_file, found)

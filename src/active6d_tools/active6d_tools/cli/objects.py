@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 
 from active6d_core.files import write_file
 from active6d_tools.cli.options import JsonFile
 from active6d_tools.cli.output import write_json, write_png
-from active6d_tools.cli.terminal import console, messages
+from active6d_tools.cli.terminal import console, messages, print_table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,26 +26,21 @@ def list_models(json_file: JsonFile = None) -> None:
 
     Example: [bold]active6d object list[/bold]
     """
-    from rich.markup import escape
-    from rich.table import Table
-
     from active6d_core.object_model import list_objects, load_object
 
     rows = [_describe(load_object(name)) for name in list_objects()]
-    table = Table(box=None, pad_edge=False)
-    for column in ("name", "diameter", "symmetry", "instances", "triangles", "features"):
-        table.add_column(column, header_style="dim", justify="left" if column in ("name", "symmetry") else "right")
-    for row in rows:
-        low, high = row["instances"]
-        table.add_row(
-            escape(row["name"]),
-            f"{row['diameter_mm']:.1f} mm",
+    cells = [
+        (
+            row["name"],
             row["symmetry"],
-            f"{low}-{high}",
+            f"{row['diameter_mm']:.1f} mm",
+            "{}-{}".format(*row["instances"]),
             f"{row['triangles']:,}",
             escape(", ".join(row["features"]) or "-"),
         )
-    console.print(table)
+        for row in rows
+    ]
+    print_table(("name", "symmetry", "diameter", "instances", "triangles", "features"), cells, left=2)
     write_json(json_file, {"objects": rows})
 
 

@@ -4,10 +4,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 
 from active6d_tools.cli.options import BagDepthScale, BagFolder, BagObject, BagRectified, BagTopics, JsonFile
 from active6d_tools.cli.output import print_left_out, write_json, write_reports
-from active6d_tools.cli.terminal import console, messages
+from active6d_tools.cli.terminal import console, messages, print_table
 
 if TYPE_CHECKING:
     from active6d_tools.report.analysis import EpisodeAnalysis
@@ -56,29 +57,17 @@ def report(
 
 def print_summary(analysis: "EpisodeAnalysis") -> None:
     """Print one line per view, then the totals."""
-    from rich.markup import escape
-    from rich.table import Table
-
     record, last = analysis.record, analysis.steps[-1]
     title = "  ".join(part for part in (record.scene or analysis.model.name, record.policy) if part)
-    table = Table(box=None, pad_edge=False, title=escape(title), title_justify="left", title_style="bold")
-    columns = ["view", "camera", "moved", "hypotheses", "objects", "attends to"]
-    for column in [*columns, *(["found", "ADD"] if last.truth else [])]:
-        table.add_column(column, justify="right", header_style="dim", no_wrap=True)
+    columns = ["view", "camera", "moved", "hypotheses", "objects", "attends to", *["found", "ADD"] * bool(last.truth)]
+    rows = []
     for step in analysis.steps:
         truth = step.truth
         attended = f"#{step.attended.index} ({step.attended.verification:.2f})" if step.attended else "-"
         scored = [f"{truth.detected.sum()}/{len(truth.detected)}", f"{truth.mean_e_add_mm:.1f} mm"] if truth else []
-        table.add_row(
-            str(step.number),
-            f"{step.azimuth:.0f}° {step.elevation:2.0f}°",
-            f"{step.moved_m:.2f} m",
-            str(step.hypothesis_count),
-            str(len(step.rows)),
-            attended,
-            *scored,
-        )
-    console.print(table)
+        camera, counts = f"{step.azimuth:.0f}° {step.elevation:2.0f}°", (step.hypothesis_count, len(step.rows))
+        rows.append([str(step.number), camera, f"{step.moved_m:.2f} m", *map(str, counts), attended, *scored])
+    print_table(columns, rows, title=f"[bold]{escape(title)}[/bold]")
     found = f"{len(last.rows)} objects"
     if last.truth:
         found = f"found {last.truth.detected.sum()} of {len(last.truth.detected)} objects, "

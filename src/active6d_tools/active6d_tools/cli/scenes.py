@@ -7,7 +7,7 @@ import typer
 
 from active6d_tools.cli.options import JsonFile, ObjectName, Seed, SensorName, Split
 from active6d_tools.cli.output import write_json, write_png
-from active6d_tools.cli.terminal import console, messages, progress_bar
+from active6d_tools.cli.terminal import console, messages, print_table, progress_bar
 
 app = typer.Typer(help="Stored scenes: generate, export, report, show.", rich_markup_mode="rich")
 
@@ -101,7 +101,6 @@ def report(
     Example: [bold]active6d scenes report --object mug --split test[/bold]
     """
     import numpy as np
-    from rich.table import Table
 
     from active6d_core.object_model import load_object
     from active6d_sim.scenes.scene_store import SPLITS, density_report, load_scene
@@ -110,11 +109,6 @@ def report(
     scenes = [load_scene(object_name, split, index) for index in range(SPLITS.get(split, 1))]
     counts = [len(scene) for scene in scenes]
     shares = density_report(scenes, np.random.default_rng(seed), moves=moves)
-    table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_column(style="dim")
-    table.add_column(justify="right")
-    table.add_row("scenes", str(len(scenes)))
-    table.add_row("objects per scene", f"{min(counts)}-{max(counts)}")
     titles = {
         "one_view": "one view",
         "random": f"{moves + 1} random views",
@@ -122,9 +116,8 @@ def report(
         "oracle": f"{moves + 1} views of a greedy oracle",
         "all_views": "all views",
     }
-    for key, title in titles.items():
-        table.add_row(title, f"{shares[key]:.3f}")
-    console.print(table)
+    rows = [("scenes", str(len(scenes))), ("objects per scene", f"{min(counts)}-{max(counts)}")]
+    print_table(("", ""), [*rows, *((title, f"{shares[key]:.3f}") for key, title in titles.items())])
     write_json(
         json_file, {"object": object_name, "split": split, "moves": moves, "seed": seed, "counts": counts, **shares}
     )

@@ -1,7 +1,12 @@
 """The terminal: results on standard output, progress and notes on standard error."""
 
-from rich.console import Console
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console, JustifyMethod
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
 #: Results only.
 console = Console()
@@ -20,3 +25,30 @@ def progress_bar() -> Progress:
         TimeRemainingColumn(compact=True),
         console=messages,
     )
+
+
+@contextmanager
+def work_progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar that is set with a description, the number of steps done and the number of all steps."""
+    with progress_bar() as bar:
+        task = bar.add_task("starting", total=None)
+        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
+
+
+def print_table(
+    columns: Sequence[str], rows: Iterable[Sequence[str]], *, title: str | None = None, left: int = 1
+) -> None:
+    """Print a table without lines; without names of columns it has no header.
+
+    Cells of the first ``left`` columns are plain text to the left, the first of them in full. The other cells may have
+    rich's markup and are to the right.
+    """
+    rows = [(*map(escape, row[:left]), *row[left:]) for row in rows]
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left", show_header=any(columns))
+    for number, column in enumerate(columns):
+        width = max((len(row[0]) for row in rows), default=None) if number == 0 else None
+        justify: JustifyMethod = "left" if number < left else "right"
+        table.add_column(column, justify=justify, header_style="dim", no_wrap=number == 0, min_width=width)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
