@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from active6d_core.object_model import ObjectModel
 
@@ -24,10 +24,11 @@ IMPORT_VARIABLE = "ACTIVE6D_IMPORT"
 #: What :meth:`Registry.origins` calls the parts of active6d itself.
 BUILT_IN = "built in"
 
+_Part = TypeVar("_Part")
 _Factory = TypeVar("_Factory", bound=Callable[..., Any])
 
 
-class Registry:
+class Registry(Generic[_Part]):
     """Factories ``(model, **parameters)`` of parts of one kind, by name.
 
     Args:
@@ -45,7 +46,7 @@ class Registry:
         self._choose = choose
         self._built_in = built_in
         self._group = group
-        self._factories: dict[str, Callable[..., Any]] = {}
+        self._factories: dict[str, Callable[..., _Part]] = {}
 
     def register(self, name: str) -> Callable[[_Factory], _Factory]:
         """Decorator that makes a factory available as ``create(name, ...)``.
@@ -80,8 +81,13 @@ class Registry:
         packages = {name: _distribution(entry_point) for name, entry_point in self._entry_points.items()}
         return modules | packages | dict.fromkeys(self._built_in, BUILT_IN)
 
-    def create(self, name: str, model: ObjectModel, **parameters: Any) -> Any:
-        """Make the part of that name, or with ``auto`` the chosen one, for one object.
+    def create(self, name: str, model: ObjectModel, **parameters: Any) -> _Part:
+        """Make a part by name for one object.
+
+        Args:
+            name: of :meth:`names`, or ``auto`` for the chosen one.
+            model: the object that fills the bin.
+            parameters: of that part; its class or factory documents them.
 
         Raises:
             ValueError: no such part, no such parameter, a library that is missing, or what the factory refuses; the
@@ -99,7 +105,7 @@ class Registry:
         except (TypeError, ValueError) as error:
             raise ValueError(f"{self._kind} '{name}': {error}") from error
 
-    def _factory(self, name: str) -> Callable[..., Any]:
+    def _factory(self, name: str) -> Callable[..., _Part]:
         if name not in self._factories and name in self._built_in:
             try:
                 import_module(self._built_in[name])

@@ -7,7 +7,7 @@ candidate they stop.
 import numpy as np
 from scipy.special import softmax
 
-from active6d_agent.policies.registry import Decision, Observation, register_policy
+from active6d_agent.policies.registry import Decision, DeterministicPolicy, Observation, register_policy
 from active6d_core.object_model import ObjectModel
 
 #: A hypothesis within this fraction of the diameter of the attended one is the same object, so it hides nothing.
@@ -60,7 +60,7 @@ class RandomPolicy:
 
 
 @register_policy("unidirectional")
-class UnidirectionalPolicy:
+class UnidirectionalPolicy(DeterministicPolicy):
     """One revolution at a fixed elevation: T + 1 views 360 / (T + 1) degrees apart, counter-clockwise.
 
     The first view is the camera's start, at any elevation; the others lie on the ring. On the ring from the
@@ -79,9 +79,6 @@ class UnidirectionalPolicy:
             raise ValueError(f"elevation_degrees is {elevation_degrees}, must be between 0 and 90")
         self._elevation = np.radians(elevation_degrees)
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing is random here."""
-
     def decide(self, observation: Observation) -> Decision:
         """The next view of the ring."""
         start, _ = observation.sphere.angles(observation.positions[0])
@@ -90,22 +87,13 @@ class UnidirectionalPolicy:
 
 
 @register_policy("max-distance")
-class MaxDistancePolicy:
+class MaxDistancePolicy(DeterministicPolicy):
     """The candidate farthest from all previous views: the largest arc to the nearest of them.
 
     "The longest distance from previous viewpoints" may also mean the last view (to and fro, 9.9 m in 5 moves) or the
     sum over all (9.1 m). The largest minimum gives 7.0 m, next to the paper's 7.66 m. It spreads views as the paper's
     figure does.
-
-    Args:
-        model: unused.
     """
-
-    def __init__(self, model: ObjectModel) -> None:
-        pass
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing is random here."""
 
     def decide(self, observation: Observation) -> Decision:
         """The farthest view."""
@@ -115,7 +103,7 @@ class MaxDistancePolicy:
 
 
 @register_policy("lowest-score")
-class LowestScorePolicy:
+class LowestScorePolicy(DeterministicPolicy):
     """Attends to the object with the lowest verification score and moves to the view that should show it best.
 
     The worth of a view has four terms. The first is the sine of its elevation seen from the object, because walls and
@@ -146,9 +134,6 @@ class LowestScorePolicy:
         self._diameter = model.diameter
         self._explore = MaxDistancePolicy(model)
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing is random here."""
-
     def decide(self, observation: Observation) -> Decision:
         """The view of highest worth for the least certain object."""
         objects, sphere = observation.objects, observation.sphere
@@ -168,18 +153,8 @@ class LowestScorePolicy:
 
 
 @register_policy("single-view")
-class SingleViewPolicy:
-    """Never moves, so that only the first view counts (T = 0).
-
-    Args:
-        model: unused.
-    """
-
-    def __init__(self, model: ObjectModel) -> None:
-        pass
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing is random here."""
+class SingleViewPolicy(DeterministicPolicy):
+    """Never moves, so that only the first view counts (T = 0)."""
 
     def decide(self, observation: Observation) -> Decision:
         """Stop."""
@@ -187,7 +162,7 @@ class SingleViewPolicy:
 
 
 @register_policy("entropy")
-class EntropyPolicy:
+class EntropyPolicy(DeterministicPolicy):
     """The candidate with the largest view entropy, computed beforehand for every view of this scene.
 
     A robot does not know the entropy of views that it has not taken. So this is a baseline for scenes in a bank (paper,
@@ -205,9 +180,6 @@ class EntropyPolicy:
         self._entropy = np.asarray(entropy, float)
         if self._entropy.ndim != 1 or not np.isfinite(self._entropy).all():
             raise ValueError("entropy must be one finite number per view")
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing is random here."""
 
     def decide(self, observation: Observation) -> Decision:
         """The view with the largest entropy."""

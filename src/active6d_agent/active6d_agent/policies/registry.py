@@ -7,7 +7,7 @@ module.
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -109,6 +109,20 @@ class Policy(Protocol):
         """The next move; a policy stops when the observation leaves it no candidate."""
 
 
+class DeterministicPolicy:
+    """Base of policies without randomness; those without parameters use its ``__init__``, too.
+
+    Args:
+        model: unused.
+    """
+
+    def __init__(self, model: ObjectModel) -> None:
+        pass
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Nothing is random here."""
+
+
 def weights_path(policy: str, object_name: str) -> Path:
     """Path of a policy's weights for an object: beside the object's description, or among the shipped ones."""
     return find_beside(f"{policy}_{object_name}.safetensors", SHIPPED_WEIGHTS)
@@ -120,7 +134,7 @@ def choose_policy(object_name: str) -> str:
 
 
 _BASELINES = "random", "unidirectional", "max-distance", "lowest-score", "single-view", "entropy"
-_registry = Registry(
+_registry: Registry[Policy] = Registry(
     "policy",
     choose_policy,
     {
@@ -131,26 +145,12 @@ _registry = Registry(
     },
     "active6d.policies",
 )
-#: Decorates a factory ``(model, **parameters) -> Policy``; see :meth:`active6d_core.registry.Registry.register`.
+#: Decorates a factory ``(model, **parameters) -> Policy``.
 register_policy = _registry.register
-#: Names that :func:`create_policy` knows beside ``auto``.
-list_policies = _registry.names
-#: Those names with where each policy comes from; see :meth:`active6d_core.registry.Registry.origins`.
-policy_origins = _registry.origins
-
-
-def create_policy(name: str, model: ObjectModel, **parameters: Any) -> Policy:
-    """Make a policy by name.
-
-    Args:
-        name: one of :func:`list_policies`, or ``auto`` for :func:`choose_policy`'s choice.
-        model: the object that fills the bin.
-        parameters: of that policy; its class documents them.
-
-    Raises:
-        ValueError: no such policy, no such parameter, or a value out of range; the message names it.
-    """
-    return _registry.create(name, model, **parameters)
+#: All names, without ``auto``; and the same with where each comes from.
+list_policies, policy_origins = _registry.names, _registry.origins
+#: Makes one by name; see :meth:`active6d_core.registry.Registry.create`.
+create_policy = _registry.create
 
 
 def uniform_attention(count: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from active6d_agent.environment.gym_environment import horizon, make_spaces
 from active6d_agent.policies.attention.encoding import decode
 from active6d_agent.policies.attention.network import encode_observations
 from active6d_agent.policies.policy_weights import load_weights, save_weights
-from active6d_agent.policies.registry import Decision, Observation, register_policy
+from active6d_agent.policies.registry import Decision, DeterministicPolicy, Observation, register_policy
 from active6d_core.object_model import ObjectModel
 
 _ALGORITHMS = {algorithm.__name__: algorithm for algorithm in (A2C, PPO, SAC, TD3)}
@@ -61,7 +61,7 @@ def _build(config: dict) -> BasePolicy:
 
 
 @register_policy("sb3")
-class Sb3Policy:
+class Sb3Policy(DeterministicPolicy):
     """The exported model, deterministic; goes to the candidate nearest to its goal.
 
     Args:
@@ -75,9 +75,6 @@ class Sb3Policy:
     def __init__(self, model: ObjectModel, weights: str) -> None:
         self._policy = load_weights(Path(weights), "sb3", _build, _REMEDY)
         self._steps = horizon(self._policy.observation_space)
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing is random here."""
 
     def decide(self, observation: Observation) -> Decision:
         """Attend to the object that the action names, if there is one, and go to the goal's nearest candidate."""

@@ -1,11 +1,11 @@
 """The interface of pose estimators, and the registry that creates them by name."""
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
-from active6d_core.object_model import ObjectModel, find_beside
+from active6d_core.object_model import find_beside
 from active6d_core.registry import Registry
 
 #: Folder of the shipped networks of the learned estimator.
@@ -33,7 +33,7 @@ def weights_path(object_name: str) -> Path:
     return find_beside(f"{object_name}.safetensors", SHIPPED_WEIGHTS)
 
 
-_registry = Registry(
+_registry: Registry[Estimator] = Registry(
     "estimator",
     choose_estimator,
     {
@@ -42,23 +42,9 @@ _registry = Registry(
     },
     "active6d.estimators",
 )
-#: Decorates a factory ``(model, **parameters) -> Estimator``; see :meth:`active6d_core.registry.Registry.register`.
+#: Decorates a factory ``(model, **parameters) -> Estimator``.
 register_estimator = _registry.register
-#: Names of all estimators, without ``auto``.
-list_estimators = _registry.names
-#: Those names with where each estimator comes from; see :meth:`active6d_core.registry.Registry.origins`.
-estimator_origins = _registry.origins
-
-
-def create_estimator(name: str, model: ObjectModel, **parameters: Any) -> Estimator:
-    """Make an estimator for one object.
-
-    Args:
-        name: one of :func:`list_estimators`, or ``auto`` for :func:`choose_estimator`'s choice.
-        model: the object to estimate poses of.
-        **parameters: keyword arguments of the estimator's factory.
-
-    Raises:
-        ValueError: unknown name, unknown parameter or bad value; the message names it and lists the known ones.
-    """
-    return _registry.create(name, model, **parameters)
+#: All names, without ``auto``; and the same with where each comes from.
+list_estimators, estimator_origins = _registry.names, _registry.origins
+#: Makes one by name; see :meth:`active6d_core.registry.Registry.create`.
+create_estimator = _registry.create

@@ -1,11 +1,10 @@
 """The interface of simulated sensors, and their registry by name."""
 
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 
 from active6d_core.camera import PinholeCamera
-from active6d_core.object_model import ObjectModel
 from active6d_core.registry import Registry
 from active6d_sim.rendering.renderer import RenderedView
 
@@ -27,29 +26,15 @@ class Sensor(Protocol):
         ...
 
 
-_registry = Registry(
+_registry: Registry[Sensor] = Registry(
     "sensor",
     lambda object_name: DEFAULT_SENSOR,
     {name: f"active6d_sim.rendering.{name}" for name in (DEFAULT_SENSOR, "structured_light", "time_of_flight")},
     "active6d.sensors",
 )
-#: Decorates a factory ``(model, **parameters) -> Sensor``; see :meth:`active6d_core.registry.Registry.register`.
+#: Decorates a factory ``(model, **parameters) -> Sensor``.
 register_sensor = _registry.register
-#: Names that :func:`create_sensor` knows beside ``auto``.
-list_sensors = _registry.names
-#: Those names with where each sensor comes from; see :meth:`active6d_core.registry.Registry.origins`.
-sensor_origins = _registry.origins
-
-
-def create_sensor(name: str, model: ObjectModel, **parameters: Any) -> Sensor:
-    """Make a sensor by name.
-
-    Args:
-        name: one of :func:`list_sensors`.
-        model: the object that fills the bin.
-        parameters: of that sensor.
-
-    Raises:
-        ValueError: no such sensor, no such parameter, or a value out of range; the message names it.
-    """
-    return _registry.create(name, model, **parameters)
+#: All names, without ``auto``; and the same with where each comes from.
+list_sensors, sensor_origins = _registry.names, _registry.origins
+#: Makes one by name; see :meth:`active6d_core.registry.Registry.create`.
+create_sensor = _registry.create

@@ -127,13 +127,18 @@ def _near_the_truth(
     pixels = np.bincount(instance[instance >= 0], minlength=len(T_camera_object))
     ranked = np.argsort(-pixels)[: np.count_nonzero(pixels)]
     label = np.arange(count) % len(ranked)
-    turn = Rotation.from_rotvec(rng.normal(0.0, 0.03, (count, 3))).as_matrix()
-    off = make_transform(turn, rng.normal(0.0, 0.002, (count, 3)))
+    off = disturbances(count, rng)
     label_of = np.zeros(len(T_camera_object) + 1, np.uint16)
     label_of[ranked] = np.arange(1, len(ranked) + 1)
     return Hypotheses.from_masks(
         T_camera_object[ranked[label]] @ off, rng.random(count), label + 1, label_of[instance], depth
     )
+
+
+def disturbances(count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 4, 4) random transforms of a few degrees and millimetres."""
+    rotation = Rotation.from_rotvec(rng.normal(0.0, 0.03, (count, 3))).as_matrix()
+    return make_transform(rotation, rng.normal(0.0, 0.002, (count, 3)))
 
 
 def measure_graph(

@@ -7,23 +7,21 @@ repetitions unless stated otherwise.
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from active6d_agent.policies.registry import Observation, Policy, create_policy, weights_path
 from active6d_agent.policies.view_attention.network import ViewAttention, save_network
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
-from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.fusion import SceneFusion
 from active6d_perception.scene.observed_surface import ObservedSurface
 from active6d_perception.scene.verification import Verifier
-from active6d_tools.benchmark.graph_overhead import PreparedViews, prepare_views
+from active6d_tools.benchmark.graph_overhead import PreparedViews, disturbances, prepare_views
 
 VIEWS = 6
 OBJECTS = 15
@@ -152,14 +150,5 @@ def time_last_view(
 
 def resize(hypotheses: Hypotheses, count: int, rng: np.random.Generator) -> Hypotheses:
     """``count`` copies of the hypotheses in turn, each shifted and rotated by a few millimetres and degrees."""
-    index = np.arange(count) % len(hypotheses)
-    turn = Rotation.from_rotvec(rng.normal(0.0, 0.03, (count, 3))).as_matrix()
-    off = make_transform(turn, rng.normal(0.0, 0.002, (count, 3)))
-    return Hypotheses(
-        hypotheses.T_camera_object[index] @ off,
-        hypotheses.score[index],
-        hypotheses.box[index],
-        hypotheses.depth[index],
-        hypotheses.label[index],
-        hypotheses.segmentation,
-    )
+    copies = hypotheses.take(np.arange(count) % len(hypotheses))
+    return replace(copies, T_camera_object=copies.T_camera_object @ disturbances(count, rng))

@@ -13,7 +13,7 @@ from torch import nn
 
 from active6d_agent.policies.attention.encoding import FEATURES, decode, encode
 from active6d_agent.policies.policy_weights import load_weights, save_weights
-from active6d_agent.policies.registry import Decision, Observation, register_policy, weights_path
+from active6d_agent.policies.registry import Decision, DeterministicPolicy, Observation, register_policy, weights_path
 from active6d_core.object_model import ObjectModel
 
 #: Numbers of a state without the history: o_t (12) and the camera's position (3).
@@ -120,7 +120,7 @@ def load_network(path: Path) -> AttentionNetwork:
 
 
 @register_policy("attention")
-class AttentionPolicy:
+class AttentionPolicy(DeterministicPolicy):
     """The trained network; always takes the mean of its Gaussian.
 
     Args:
@@ -133,9 +133,6 @@ class AttentionPolicy:
 
     def __init__(self, model: ObjectModel, weights: str = "") -> None:
         self.network = load_network(Path(weights) if weights else weights_path("attention", model.name))
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """The mean is taken, so nothing is random here."""
 
     def decide(self, observation: Observation) -> Decision:
         """Attend to one object and go to the candidate nearest to the mean."""

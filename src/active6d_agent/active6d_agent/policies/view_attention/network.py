@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from active6d_agent.policies.policy_weights import load_weights, save_weights
-from active6d_agent.policies.registry import Decision, Observation, register_policy, weights_path
+from active6d_agent.policies.registry import Decision, DeterministicPolicy, Observation, register_policy, weights_path
 from active6d_agent.policies.view_attention.features import (
     ITEM_FEATURES,
     PAIR_FEATURES,
@@ -239,7 +239,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @register_policy("view-attention")
-class ViewAttentionPolicy:
+class ViewAttentionPolicy(DeterministicPolicy):
     """Goes to the view of highest worth: its expected gain, plus that of the moves after it, less the travel.
 
     Args:
@@ -277,9 +277,6 @@ class ViewAttentionPolicy:
         self._tray = Tray.for_model(model)._replace(**{name: size for name, size in sizes.items() if size is not None})
         if not (0 < self._tray.width < np.inf and 0 <= self._tray.wall_height < np.inf):
             raise ValueError(f"bin_width must be positive and wall_height not negative, got {self._tray}")
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Nothing is random here."""
 
     def decide(self, observation: Observation) -> Decision:
         """The view of highest worth, and the object that it attends to."""
