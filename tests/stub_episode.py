@@ -91,7 +91,8 @@ def _step(rng: np.random.Generator, stamp: int, T_world_camera: np.ndarray, goal
     depth = rng.uniform(0.5, 1.0, (CAMERA.height, CAMERA.width)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.1] = np.nan
     segmentation = rng.integers(0, 4, depth.shape).astype(np.uint16)
-    hypotheses = Hypotheses.from_masks(_poses(rng, 3), rng.random(3), np.array([1, 2, 3]), segmentation, depth)
+    T_camera_object = _poses(rng, 3) + np.pad([[0.7]], ((2, 1), (3, 0)))  # in front of the camera
+    hypotheses = Hypotheses.from_masks(T_camera_object, rng.random(3), np.array([1, 2, 3]), segmentation, depth)
     count = 1 + stamp // 500_000_000 % 5
     objects = SceneObjects(
         T_world_object=_poses(rng, count),
