@@ -1,5 +1,4 @@
 """Geometry, data contracts and metrics shared by every active6d package.
 
-Only :mod:`.conversions`, :mod:`.node` and :mod:`.optional_outputs` import ROS; everything else needs numpy, scipy and
-trimesh alone.
+Only the modules in :mod:`active6d_core.ros` import ROS.
 """

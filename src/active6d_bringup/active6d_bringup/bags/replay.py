@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.index import read_bag
@@ -19,6 +18,7 @@ from active6d_bringup.bags.writer import TYPESTORE, stamp_of
 from active6d_bringup.graph.composition import GraphDescription, OnEvent, default_params_file, running
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
 from active6d_core.ros.conversions import read_table
+from active6d_core.ros.node import qos_of
 from active6d_core.ros.topics import PERCEPTION_TOPICS, Topic
 
 #: What perception makes of a view, by topic name.
@@ -219,13 +219,12 @@ class _Listener(Node):
     def __init__(self, context: Context) -> None:
         super().__init__("replay_listener", context=context, start_parameter_services=False, enable_rosout=False)
         self.payloads: dict[tuple[str, int], bytes] = {}
-        qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for topic in PERCEPTION_TOPICS:
 
             def keep(payload: bytes, topic: Topic = topic) -> None:
                 self.payloads[topic.name, stamp_of(topic.type, payload)] = payload
 
-            self.create_subscription(topic.message_type, topic.name, keep, qos, raw=True)
+            self.create_subscription(topic.message_type, topic.name, keep, qos_of(topic, 100), raw=True)
 
     def answered(self, stamps: list[int]) -> list[int]:
         """The views for which everything that is compared has arrived."""

@@ -15,7 +15,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from active6d_bringup.bags.writer import RecordingError
@@ -38,6 +37,7 @@ from active6d_core.ros.conversions import (
     poses_from_array,
     stamp_to_ns,
 )
+from active6d_core.ros.node import qos_of
 from active6d_core.view_sphere import ViewSphere
 
 #: How long a recorder may lag behind the end of an episode in which a node died.
@@ -343,9 +343,6 @@ class EpisodeMonitor(Node):
         )
 
     def _listen(self, topic: topics.Topic, callback: Callable[[Any], None]) -> None:
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.transient_local else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
-
         def heard(message: Any) -> None:
             try:
                 callback(message)
@@ -355,7 +352,7 @@ class EpisodeMonitor(Node):
             self.received += topic is not topics.DIAGNOSTICS
             self._report_steps()
 
-        self.create_subscription(topic.message_type, topic.name, heard, qos)
+        self.create_subscription(topic.message_type, topic.name, heard, qos_of(topic, 100))
 
     def _report_steps(self) -> None:
         for index, stamp in enumerate(sorted(self._poses.keys() & self._objects)):
