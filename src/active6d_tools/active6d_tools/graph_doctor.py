@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
-from active6d_core.ros.conversions import HARDWARE_ID
+from active6d_core.ros.conversions import HARDWARE_ID, status_values
 from active6d_core.ros.topics import CONTRACT
 from active6d_tools.machine_doctor import Check
 
@@ -94,7 +94,7 @@ class _Listener(Node):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             inside = status.name.startswith(self.get_namespace().rstrip("/") + "/")
-            if status.hardware_id == HARDWARE_ID and inside and "state" in _values(status):
+            if status.hardware_id == HARDWARE_ID and inside and "state" in status_values(status):
                 self.heartbeats[status.name] = status
 
 
@@ -104,7 +104,7 @@ def _check_nodes(listener: _Listener, where: str) -> Iterator[Check]:
         yield Check("Nodes", "heartbeats", False, True, f"no node publishes diagnostics {where}", fix)
     for name, status in sorted(listener.heartbeats.items()):
         detail = status.message
-        awaited = _values(status).get("waiting_for", "")
+        awaited = status_values(status).get("waiting_for", "")
         sources = {end.node_name for topic in awaited.split(",") if topic for end in listener.publishers(topic)}
         if sources:
             detail += f" (published by {', '.join(sorted(sources))})"
@@ -146,7 +146,3 @@ def _mismatches(publishers: list[Any], subscribers: list[Any]) -> Iterator[str]:
 
 def _names(endpoints: list[Any]) -> str:
     return ", ".join(sorted({end.node_name for end in endpoints}))
-
-
-def _values(status: DiagnosticStatus) -> dict[str, str]:
-    return {pair.key: pair.value for pair in status.values}

@@ -55,36 +55,19 @@ def works(checks: list[Check]) -> bool:
 
 def _python() -> Check:
     version = platform.python_version()
-    ok = (3, 10) <= sys.version_info[:2] <= (3, 13)
+    ok = (3, 11) <= sys.version_info[:2] <= (3, 13)
     detail = f"{version} at {sys.executable}"
-    return Check("Python", "Python", ok, True, detail, "" if ok else "use Python 3.11 (pybullet's wheels end there)")
+    return Check("Python", "Python", ok, True, detail, "" if ok else "use Python 3.11, 3.12 or 3.13")
 
 
 def _libraries() -> Iterator[Check]:
-    system = {
-        "usb-1.0": "libusb-1.0-0",
-        "GL": "libgl1",
-        "EGL": "libegl1",
-        "X11": "libx11-6",
-        "idn2": "libidn2-0",
-        "udev": "libudev1",
-    }
-    for file, package in system.items():
+    system = "usb-1.0:libusb-1.0-0 GL:libgl1 EGL:libegl1 X11:libx11-6 idn2:libidn2-0 udev:libudev1"
+    for file, package in (item.split(":") for item in system.split()):
         found = ctypes.util.find_library(file)
         fix = "" if found else f"apt install {package} (as root); Open3D loads it"
         yield Check("System libraries", f"lib{file}", bool(found), False, found or "not found", fix)
-    needed = {
-        "numba": "numba",
-        "numpy": "numpy",
-        "scipy": "scipy",
-        "trimesh": "trimesh",
-        "open3d": "open3d",
-        "rosbags": "rosbags",
-        "jinja2": "jinja2",
-        "matplotlib": "matplotlib",
-        "PIL": "pillow",
-    }
-    for module, distribution in needed.items():
+    for module in "numba numpy scipy trimesh open3d rosbags jinja2 matplotlib PIL".split():
+        distribution = "pillow" if module == "PIL" else module
         yield _import_check("Python libraries", module, distribution, needed=True, fix=PIP)
     optional = {
         # The wrapper, since pybullet itself prints a banner.
@@ -130,21 +113,11 @@ def _ros() -> Iterator[Check]:
         f"{distribution or 'jazzy'} ({'apt' if distribution else 'PyPI wheels'})",
         "" if distribution in (None, "jazzy") else "active6d is built for jazzy: source /opt/ros/jazzy/setup.bash",
     )
-    for package in (
-        "sensor_msgs",
-        "geometry_msgs",
-        "std_srvs",
-        "visualization_msgs",
-        "diagnostic_msgs",
-        "lifecycle_msgs",
-    ):
+    for package in "sensor_msgs geometry_msgs std_srvs visualization_msgs diagnostic_msgs lifecycle_msgs".split():
         module = f"{package}.{'srv' if package == 'std_srvs' else 'msg'}"
         yield _import_check("ROS 2", module, package, needed=True, fix=pip_ros)
-    for module, purpose in (
-        ("vision_msgs", "Detection3DArray output"),
-        ("tf2_msgs", "/tf output"),
-        ("launch_ros", "launch files"),
-    ):
+    optional = {"vision_msgs": "Detection3DArray output", "tf2_msgs": "/tf output", "launch_ros": "launch files"}
+    for module, purpose in optional.items():
         fix = f"{APT_ROS}{module.replace('_', '-')} ({purpose})"
         yield _import_check("ROS 2, optional", module, module, needed=False, fix=fix)
     for program, package in (("ros2", "ros-jazzy-ros2cli"), ("colcon", "python3-colcon-common-extensions")):
@@ -154,14 +127,7 @@ def _ros() -> Iterator[Check]:
 
 
 def _project() -> Iterator[Check]:
-    for package in (
-        "active6d_core",
-        "active6d_sim",
-        "active6d_perception",
-        "active6d_agent",
-        "active6d_bringup",
-        "active6d_tools",
-    ):
+    for package in (f"active6d_{name}" for name in "core sim perception agent bringup tools".split()):
         needed = package != "active6d_sim"  # a robot has its own camera
         yield _import_check("active6d", package, package, needed=needed, fix="pip install -e src/" + package)
     fix = "fix the description it names, or ACTIVE6D_OBJECT_PATH, which adds folders"

@@ -37,6 +37,7 @@ from active6d_core.ros.conversions import (
     poses_from_array,
     stamp_to_ns,
 )
+from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart
 from active6d_core.ros.node import qos_of
 from active6d_core.view_sphere import ViewSphere
 
@@ -395,13 +396,13 @@ class EpisodeMonitor(Node):
         self._ground_truth = poses_from_array(message, message.header.frame_id)
 
     def _on_start(self, message: DiagnosticArray) -> None:
-        self._info.update(_values(message))
+        self._info.update(EpisodeStart.from_message(message).info)
 
     def _on_end(self, message: DiagnosticArray) -> None:
-        # Both sides say their seed; the camera's is the one of the heap.
-        self._info = {**_values(message), **self._info}
-        self.end_stamp = stamp_to_ns(message.header.stamp)
-        self._reason = message.status[0].message if message.status else ""
+        end = EpisodeEnd.from_message(message)
+        # Both sides give their seed; the camera's is the one of the pile.
+        self._info = {**end.info, **self._info}
+        self.end_stamp, self._reason = end.stamp, end.reason
         self._ended = time.monotonic()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -410,7 +411,3 @@ class EpisodeMonitor(Node):
                 self.last_refusal = [f"{status.name} refused {status.message}"]
         latencies = latencies_from_diagnostics(message)
         self._latencies.setdefault(stamp_to_ns(message.header.stamp), {}).update(latencies)
-
-
-def _values(message: DiagnosticArray) -> dict[str, str]:
-    return {pair.key: pair.value for status in message.status for pair in status.values}

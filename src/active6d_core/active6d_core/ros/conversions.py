@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion, Vector3
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
@@ -519,11 +519,16 @@ def _read_box(table: np.ndarray) -> np.ndarray:
 # Diagnostics
 
 
+def status_values(status: DiagnosticStatus) -> dict[str, str]:
+    """The values of a diagnostic status by key."""
+    return {pair.key: pair.value for pair in status.values}
+
+
 def latencies_from_diagnostics(message: DiagnosticArray) -> dict[str, float]:
     """Milliseconds that this project's nodes worked on a view, by node name; others' statuses are ignored."""
     latencies = {}
     for status in message.status:
-        value = {pair.key: pair.value for pair in status.values}.get("latency_ms", "")
+        value = status_values(status).get("latency_ms", "")
         if status.hardware_id == HARDWARE_ID and re.fullmatch(r"\d+(\.\d+)?", value):
             latencies[status.name.rsplit("/", 1)[-1]] = float(value)
     return latencies
