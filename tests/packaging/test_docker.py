@@ -9,6 +9,8 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "docker/Dockerfile").read_text().replace("\\\n", " ")
+#: What .dockerignore leaves in the context.
+CONTEXT = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
 SERVICES = yaml.safe_load((ROOT / "docker/compose.yaml").read_text())["services"]
 PARAMETERS = yaml.safe_load((ROOT / "src/active6d_bringup/config/active6d.yaml").read_text())
 
@@ -20,6 +22,7 @@ def test_copied_paths_exist():
         *sources, _ = copy.split()
         for source in sources:
             assert (ROOT / source).exists(), source
+            assert source.partition("/")[0] in CONTEXT, f".dockerignore leaves out {source}"
 
 
 def test_stages_that_are_referred_to_exist():
