@@ -19,7 +19,13 @@ from active6d_perception.estimators.dense.dense_estimator import DenseEstimator,
 from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize, split
 from active6d_perception.estimators.dense.network_input import output_camera, ray_frames, ray_rotation, reduction
 from active6d_perception.estimators.dense.sphere_bins import CENTRES
-from active6d_perception.estimators.dense.trained_network import TrainedNetwork, load_network, save_network
+from active6d_perception.estimators.dense.trained_network import (
+    SCORE_FEATURES,
+    TrainedNetwork,
+    load_network,
+    save_network,
+    save_score,
+)
 from active6d_perception.estimators.dense.training.augmentation import augment, crop
 from active6d_perception.estimators.dense.training.batches import TrainingViews, batches, input_tensor
 from active6d_perception.estimators.dense.training.loop import TrainingOptions, _Run, train
@@ -28,6 +34,7 @@ from active6d_perception.estimators.dense.training.samples import make_sample, r
 from active6d_perception.estimators.dense.training.targets import make_targets
 from active6d_perception.estimators.dense.training.validation import validate
 from active6d_perception.estimators.registry import create_estimator, list_estimators
+from active6d_perception.estimators.score_model import ScoreModel
 from active6d_sim.datasets.training_views import FIRST_SEED, random_camera, training_scene
 from active6d_sim.rendering.renderer import SceneRenderer
 from active6d_sim.scenes.scene import Bin, Scene
@@ -417,6 +424,22 @@ def test_a_training_starts_from_trained_weights(tmp_path, trained):
         assert torch.allclose(ours[name], theirs[name], atol=1e-5)
     with pytest.raises(ValueError, match="cannot start from these weights"):
         _Run(load_object("mug"), tmp_path / "other", quick(start=str(trained[1]), size=NetworkSize()), "cpu")
+
+
+def test_a_fitted_score_is_kept_beside_the_weights(tmp_path, trained):
+    model = load_object("mug")
+    for suffix in (".safetensors", ".json"):
+        (tmp_path / f"copy{suffix}").write_bytes(trained[1].with_suffix(suffix).read_bytes())
+    path = tmp_path / "copy.safetensors"
+    assert load_network(path, model).score is None
+    save_score(path, ScoreModel(SCORE_FEATURES, np.array([1.0, -2.0, 3.0, 0.5]), -4.0))
+    score = load_network(path, model).score
+    assert score.probability(np.array([0.5, 0.1, 0.8, 2.0])) == pytest.approx(
+        1 / (1 + np.exp(-(0.5 - 0.2 + 2.4 + 1 - 4)))
+    )
+    save_score(path, ScoreModel(("other",), np.ones(1), 0.0))
+    with pytest.raises(ValueError, match="not a score model: it is for the features other"):
+        load_network(path, model)
 
 
 def test_the_coordinates_heads_do_not_change_what_is_deployed(mug_view):

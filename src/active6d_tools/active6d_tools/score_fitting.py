@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -10,6 +11,16 @@ from active6d_core.metrics import DETECTION_FRACTION, add_s, e_add, match
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
+from active6d_perception.estimators.dense.network_input import reduce_view
+from active6d_perception.estimators.dense.trained_network import (
+    SCORE_FEATURES,
+    SCORE_LOWERED_BY,
+    load_network,
+    save_score,
+)
+from active6d_perception.estimators.detection_rates import calibration_error
+from active6d_perception.estimators.score_model import ScoreModel
 from active6d_sim.scenes.scene_store import SPLITS, load_scene
 from active6d_tools.benchmark.grid_views import GridViews
 from active6d_tools.training_data import VALIDATION_SPLITS
@@ -39,6 +50,50 @@ class JudgedPoses:
     def weight(self) -> np.ndarray:
         """(k,) weights with which every split counts alike."""
         return np.asarray(1.0 / np.bincount(self.split, minlength=len(VALIDATION_SPLITS))[self.split])
+
+
+def fit_dense_score(
+    model: ObjectModel,
+    weights: Path,
+    views: int,
+    rng: np.random.Generator,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, float]:
+    """Fit the score of a trained network and write it beside the weights.
+
+    Args:
+        model: the object.
+        weights: ``.safetensors`` file of the network.
+        views: number of views of each validation scene.
+        rng: random generator of the views.
+        on_progress: as :func:`judge_validation_views`.
+
+    Returns:
+        Calibration error and precision at score .5 by split, on the views that it was fitted on.
+    """
+    estimator = DenseEstimator(model, load_network(weights, model), DenseParameters(min_score=0.0))
+
+    def judge(view: View) -> tuple[np.ndarray, np.ndarray]:
+        poses, _ = estimator.locate(reduce_view(view))
+        return poses.T_camera_object, poses.features
+
+    poses = judge_validation_views(model, judge, views, rng, on_progress)
+    score = ScoreModel.fit(SCORE_FEATURES, poses.features, poses.right, poses.weight, against=SCORE_LOWERED_BY)
+    save_score(weights, score)
+    return summarise_score(score, poses)
+
+
+def summarise_score(score: ScoreModel, poses: JudgedPoses) -> dict[str, float]:
+    """By split: the calibration error, and of the poses with score .5 or more the share that is right."""
+    probability = score.probability(poses.features)
+    summary: dict[str, float] = {}
+    for number, split in enumerate(VALIDATION_SPLITS):
+        chosen = poses.split == number
+        sure = chosen & (probability >= 0.5)
+        summary[f"{split}_calibration_error"] = calibration_error(probability[chosen], poses.right[chosen]) or 0.0
+        summary[f"{split}_precision_at_half"] = float(poses.right[sure].mean()) if sure.any() else 0.0
+        summary[f"{split}_right_found"] = float(sure[poses.right & chosen].mean())
+    return summary
 
 
 def judge_validation_views(

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Train the pose estimator or a policy.", rich_markup_mode="rich")
 
+#: Views of each validation scene that the score is fitted on.
+_SCORE_VIEWS = 5
 _DATA = "Folder of the views and checkpoints; by default active6d/training/OBJECT in the cache folder."
 
 
@@ -72,9 +74,27 @@ def estimator(
         steps=steps, batch=batch, learning_rate=rate, seed=seed, start=str(start or ""), loss=LossWeights(coordinates=0)
     )
     best, history = _train(model, shards, folder / run, options, cores)
+    score = _fit_score(model, best, seed)
     if export is not None:
         export_weights(best, export, object_name)
-    write_json(json_file, {"object": object_name, "weights": str(best), "validation": history})
+    write_json(json_file, {"object": object_name, "weights": str(best), "validation": history, "score": score})
+
+
+def _fit_score(model: "ObjectModel", weights: Path, seed: int) -> dict[str, float]:
+    """Fit the score on validation views; its quality on them."""
+    import numpy as np
+
+    from active6d_tools.score_fitting import fit_dense_score
+
+    with progress_bar() as bar:
+        task = bar.add_task(f"{model.name}: fitting the score")
+        return fit_dense_score(
+            model,
+            weights,
+            _SCORE_VIEWS,
+            np.random.default_rng(seed),
+            lambda done, total: bar.update(task, completed=done, total=total),
+        )
 
 
 def _train(

@@ -13,7 +13,6 @@ import numpy as np
 
 from active6d_core.files import write_file
 from active6d_core.object_model import load_object
-from active6d_perception.estimators.detection_rates import calibration_error
 from active6d_perception.estimators.geometric.foreground import measure_surface
 from active6d_perception.estimators.geometric.geometric_estimator import (
     AGAINST,
@@ -23,8 +22,7 @@ from active6d_perception.estimators.geometric.geometric_estimator import (
 )
 from active6d_perception.estimators.score_model import ScoreModel
 from active6d_tools.cli.terminal import console, progress_bar
-from active6d_tools.score_fitting import JudgedPoses, judge_validation_views
-from active6d_tools.training_data import VALIDATION_SPLITS
+from active6d_tools.score_fitting import JudgedPoses, judge_validation_views, summarise_score
 
 _OBJECTS = ("bunny", "coffee_cup", "mug")
 
@@ -55,17 +53,8 @@ def main() -> None:
     )
     model = ScoreModel.fit(FEATURES, features, right, weight, against=AGAINST)
     for name, part in zip(_OBJECTS, parts, strict=True):
-        score = model.probability(part.features)
-        for number, split in enumerate(VALIDATION_SPLITS):
-            chosen = part.split == number
-            sure = chosen & (score >= 0.5)
-            error = calibration_error(score[chosen], part.right[chosen])
-            console.print(
-                f"{name:11} {split:9} {chosen.sum():5} candidates, calibration error {error:.3f}; "
-                f"{sure.sum()} with score >= .5, of these right {part.right[sure].mean():.2f}, "
-                f"of the right ones {sure[part.right & chosen].mean():.2f}",
-                highlight=False,
-            )
+        for key, value in summarise_score(model, part).items():
+            console.print(f"{name:11} {key:30} {value:.3f}", highlight=False)
     text = json.dumps(model.as_dict(), indent=1) + "\n"
     console.print(text, highlight=False)
     if arguments.write:

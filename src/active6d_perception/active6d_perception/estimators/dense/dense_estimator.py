@@ -1,14 +1,14 @@
 """The learned estimator: pixel-wise regression and depth registration (paper, "6D object pose estimation")."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from scipy.special import expit, softmax
+from scipy.special import softmax
 
 from active6d_core.camera import View, pool_depth
 from active6d_core.hypotheses import Hypotheses
@@ -32,9 +32,10 @@ from active6d_perception.estimators.dense.network_input import (
     reduction,
 )
 from active6d_perception.estimators.dense.orientation_search import OrientationSearch
-from active6d_perception.estimators.dense.trained_network import TrainedNetwork, load_network
+from active6d_perception.estimators.dense.trained_network import SCORE_FEATURES, TrainedNetwork, load_network
 from active6d_perception.estimators.refinement import claim_pixels, refine, weigh_evidence
 from active6d_perception.estimators.registry import register_estimator, weights_path
+from active6d_perception.estimators.score_model import ScoreModel
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.suppression import suppress
@@ -53,12 +54,9 @@ _NETWORK_TRUST = 0.6
 _GATES = (0.008, 0.004)  # metres, of refinement
 _ITERATIONS = 3  # of refinement with each gate; more change nothing on the validation views
 _SAMPLES = 192  # of the model's surface, in refinement
-# Logistic regression: the probability that an instance is there and its body is right. The regressor is the share of
-# its visible surface that is measured where it should be, less the share that the camera looked through. The offset
-# depends on the object, since the best of several tried orientations fits somewhat even where all are wrong. Fitted on
-# the validation views of cup and mug; with the bunny's offset .90 of its hypotheses there are right.
-_PRESENCE_SLOPE = 14.0
-_PRESENCE_OFFSET = {AxisRotation.VISIBLE: -1.2, AxisRotation.SHOWN_BY_FEATURE: -0.8, AxisRotation.INVISIBLE: -0.8}
+# The probability that an instance is there and its body is right, for networks whose score was not fitted. Fitted ones
+# have their regression beside the weights (active6d_tools.score_fitting).
+_UNFITTED_SCORE = ScoreModel(SCORE_FEATURES, np.array([14.0, -14.0, 0.0, 0.0]), -0.8)
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class DenseParameters:
         ValueError: a value is out of range.
     """
 
-    min_score: float = 0.3
+    min_score: float = 0.15
     refined: bool = True
     alternatives: int = 1
     decoding: DecodingParameters = field(default_factory=DecodingParameters)
@@ -96,16 +94,18 @@ class Poses:
         score: (k,) probability that the pose is right: that the instance is there, times the certainty.
         instance: (k,) index of the instance; several poses of one instance are alternatives.
         certainty: (k,) posterior probability of the rotation about the axis, 1 where it is not ambiguous.
+        features: (k, f) regressors of the probability that the instance is there, :data:`.SCORE_FEATURES`.
     """
 
     T_camera_object: np.ndarray
     score: np.ndarray
     instance: np.ndarray
     certainty: np.ndarray
+    features: np.ndarray
 
     def take(self, index: np.ndarray) -> "Poses":
         """The poses at ``index``, in that order."""
-        return Poses(self.T_camera_object[index], self.score[index], self.instance[index], self.certainty[index])
+        return Poses(*(getattr(self, item.name)[index] for item in fields(self)))
 
 
 def likely_axis_rotations(probability: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -193,10 +193,9 @@ class DenseEstimator:
             self.parameters.decoding,
         )
         if not len(instances):
-            nothing = np.zeros(0)
-            return Poses(np.zeros((0, 4, 4)), nothing, nothing.astype(int), nothing), np.zeros(
-                view.depth.shape, np.uint16
-            )
+            nothing, features = np.zeros(0), np.zeros((0, len(SCORE_FEATURES)))
+            poses = Poses(np.zeros((0, 4, 4)), nothing, nothing.astype(int), nothing, features)
+            return poses, np.zeros(view.depth.shape, np.uint16)
         surface = self._timed("surface", MeasuredSurface.of, view, instances)
         candidates = self._timed("poses", self._find_poses, instances, surface)
         return self._timed("judging", self._judge, *candidates, surface)
@@ -271,9 +270,18 @@ class DenseEstimator:
     def _judge(
         self, T_camera_object: np.ndarray, instance: np.ndarray, certainty: np.ndarray, surface: MeasuredSurface
     ) -> tuple[Poses, np.ndarray]:
-        offset = _PRESENCE_OFFSET[self._trained.canonical_frame.axis_rotation]
-        presence = expit(_PRESENCE_SLOPE * self._fit(T_camera_object, surface) + offset)
-        return self._report(Poses(T_camera_object, presence * certainty, instance, certainty), surface)
+        evidence = weigh_evidence(self._views, T_camera_object, surface.depth, surface.normals, surface.camera)
+        pixels = np.bincount(surface.owner[surface.owner >= 0], minlength=instance.max(initial=0) + 1)[instance]
+        features = np.column_stack(
+            [
+                evidence.fitting,
+                evidence.violated,
+                evidence.fitting / np.maximum(1.0 - evidence.occluded, 0.1),
+                np.log(np.maximum(pixels, 1)),
+            ]
+        )
+        presence = (self._trained.score or _UNFITTED_SCORE).probability(features)
+        return self._report(Poses(T_camera_object, presence * certainty, instance, certainty, features), surface)
 
     def _report(self, poses: Poses, surface: MeasuredSurface) -> tuple[Poses, np.ndarray]:
         """Drop duplicates, poses with a low score and poses that explain no pixels; renumber the instances."""
@@ -300,8 +308,7 @@ class DenseEstimator:
         relabel = np.zeros(len(first) + 1, np.uint16)
         relabel[seen + 1] = np.arange(1, len(seen) + 1)
         poses = poses.take(np.flatnonzero(number[poses.instance] >= 0))
-        renumbered = Poses(poses.T_camera_object, poses.score, number[poses.instance], poses.certainty)
-        return renumbered, relabel[label]
+        return replace(poses, instance=number[poses.instance]), relabel[label]
 
     def _centres(self, poses: Poses) -> np.ndarray:
         """(k, k) distances between the axis frames' origins, metres."""

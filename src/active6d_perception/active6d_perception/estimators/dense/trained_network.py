@@ -14,8 +14,14 @@ from active6d_core.se3 import is_rigid
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
 from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize
 from active6d_perception.estimators.dense.network_input import CHANNELS
+from active6d_perception.estimators.score_model import ScoreModel
 
 _FORMAT = 1
+#: Regressors of the score: shares of the visible surface that fit, that are looked through, and that fit of what is not
+#: occluded; and the logarithm of the number of the instance's pixels at the network's resolution.
+SCORE_FEATURES = ("fitting", "violated", "fitting_unoccluded", "log_pixels")
+#: Features that can only lower it.
+SCORE_LOWERED_BY = ("violated",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +35,7 @@ class TrainedNetwork:
         diameter: the object's, metres.
         size: channels of the network's layers.
         training: options and validation results of the training; kept for information only.
+        score: from features of a pose to the probability that it is right; None if it was not fitted.
     """
 
     network: DenseNetwork
@@ -37,6 +44,7 @@ class TrainedNetwork:
     diameter: float
     size: NetworkSize
     training: dict = field(default_factory=dict)
+    score: ScoreModel | None = None
 
 
 def save_network(path: Path, trained: TrainedNetwork) -> None:
@@ -62,6 +70,13 @@ def save_network(path: Path, trained: TrainedNetwork) -> None:
     write_file(path.with_suffix(".json"), json.dumps(description, indent=1) + "\n")
 
 
+def save_score(path: Path, score: ScoreModel) -> None:
+    """Write a fitted score into the JSON file beside the weights ``path``."""
+    described = path.with_suffix(".json")
+    description = json.loads(described.read_text())
+    write_file(described, json.dumps({**description, "score": score.as_dict()}, indent=1) + "\n")
+
+
 def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
     """Read a trained network for an object. Nothing in the files is executed.
 
@@ -79,6 +94,7 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
             raise ValueError("T_object_axis is not a rigid transform")
         heads = HEADS if description["heads"] == HEADS else DEPLOYED_HEADS
         network = DenseNetwork(size, heads)
+        score = ScoreModel.from_dict(description["score"], SCORE_FEATURES) if "score" in description else None
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path.with_suffix('.json')}: bad description of a network ({error})") from error
     try:
@@ -88,9 +104,8 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
         raise ValueError(
             f"{path}: damaged, or not the weights that its .json describes ({reason}); {_advice(model)}"
         ) from error
-    return TrainedNetwork(
-        network.eval(), canonical_frame, model.name, model.diameter, size, description.get("training") or {}
-    )
+    training = description.get("training") or {}
+    return TrainedNetwork(network.eval(), canonical_frame, model.name, model.diameter, size, training, score)
 
 
 def _read_description(path: Path, model: ObjectModel) -> dict:

@@ -145,7 +145,9 @@ def train(
             averaged = TrainedNetwork(run.averaged_on_cpu(), canonical_frame, model.name, model.diameter, options.size)
             run.history.append({"step": run.step, **mean, **validate(model, averaged, validation)})
             if max(run.history, key=worth)["step"] == run.step:
-                training = {"options": asdict(options), "heaps": len(shards), "validation": run.history[-1]}
+                # Where the starting weights lay is nobody's business; their name is enough.
+                named = {**asdict(options), "start": Path(options.start).name}
+                training = {"options": named, "heaps": len(shards), "validation": run.history[-1]}
                 save_network(
                     best,
                     TrainedNetwork(
