@@ -24,7 +24,7 @@ from active6d_perception.estimators.score_model import ScoreModel
 from active6d_tools.cli.terminal import console, progress_bar
 from active6d_tools.score_fitting import JudgedPoses, judge_validation_views, summarise_score
 
-_OBJECTS = ("bunny", "coffee_cup", "mug")
+_OBJECTS = ("coffee_cup", "bunny", "mug")
 
 
 def collect(name: str, views: int) -> JudgedPoses:
