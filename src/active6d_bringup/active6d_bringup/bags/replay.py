@@ -63,7 +63,8 @@ class Comparison:
         topic: in ``COMPARED``.
         recorded: rows (of a table) or pixels (of an image) in the bag, None where the bag has no such message.
         live: the same of the live message.
-        equal: whether every byte agrees (CDR's padding aside, which has no meaning).
+        equal: whether every byte agrees (CDR's padding aside, which has no meaning), or every recorded column where the
+            bag has fewer of them.
         differences: column to the largest absolute difference, or to the share of pixels for an image; NaN where the
             sizes differ.
     """
@@ -185,7 +186,10 @@ def describe(
 
 
 def compare(stamp: int, topic: str, recorded: bytes | None, live: bytes) -> Comparison:
-    """Compare the serialized messages of one view and topic."""
+    """Compare the serialized messages of one view and topic.
+
+    A bag of an earlier version may lack columns of a table: its own columns are compared then.
+    """
     message_type = COMPARED[topic].type
     found: Any = TYPESTORE.deserialize_cdr(live, message_type)
     size = found.width * found.height
@@ -194,22 +198,25 @@ def compare(stamp: int, topic: str, recorded: bytes | None, live: bytes) -> Comp
     expected: Any = TYPESTORE.deserialize_cdr(recorded, message_type)
     equal = TYPESTORE.serialize_cdr(found, message_type) == TYPESTORE.serialize_cdr(expected, message_type)
     differences = {} if equal else _differences(expected, found)
+    if not differences and hasattr(expected, "fields"):
+        equal |= expected.header == found.header and len(expected.fields) < len(found.fields)
     return Comparison(stamp, topic, expected.width * expected.height, size, equal, differences)
 
 
 def _differences(expected: Any, found: Any) -> dict[str, float]:
-    if len(expected.data) != len(found.data):
+    is_image = hasattr(expected, "encoding")
+    if (expected.width, expected.height) != (found.width, found.height) or (
+        is_image and len(expected.data) != len(found.data)
+    ):
         return {"size": float("nan")}
-    if hasattr(expected, "encoding"):
+    if is_image:
         wrong = (expected.data != found.data).reshape(expected.height * expected.width, -1).any(axis=1)
         return {"pixels": float(wrong.mean())}
     tables = [read_table(message) for message in (expected, found)]
-    if tables[0].dtype != tables[1].dtype:
+    names = (tables[0].dtype.fields or {}).keys()
+    if not names <= (tables[1].dtype.fields or {}).keys():
         return {"columns": float("nan")}
-    largest = {
-        name: np.abs(tables[0][name].astype(float) - tables[1][name]).max(initial=0.0)
-        for name in tables[0].dtype.fields or ()
-    }
+    largest = {name: np.abs(tables[0][name].astype(float) - tables[1][name]).max(initial=0.0) for name in names}
     return {name: float(difference) for name, difference in largest.items() if difference != 0}
 
 
