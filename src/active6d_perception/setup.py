@@ -10,7 +10,9 @@ setup(
     maintainer_email="active6d@example.org",
     license="Apache-2.0",
     packages=find_packages(),
-    package_data={package: ["estimators/dense/weights/*", "estimators/geometric/score.json", "py.typed"]},
+    package_data={
+        package: ["estimators/dense/weights/*", "estimators/geometric/score.json", "scene/weights/*", "py.typed"]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

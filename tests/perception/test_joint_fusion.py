@@ -11,7 +11,7 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.ambiguity import ambiguity_of
-from active6d_perception.scene.belief_weights import BeliefWeights
+from active6d_perception.scene.belief_weights import BeliefWeights, Scorer
 from active6d_perception.scene.expected_visibility import OPEN_TABLE
 from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.measured_cases import CASES, FITTING, LOOKED_THROUGH, WHAT, WHOSE
@@ -33,11 +33,11 @@ def hand_set_weights() -> BeliefWeights:
     case = np.zeros((WHAT, WHOSE))
     case[FITTING], case[LOOKED_THROUGH] = 2.0, -2.0
     rotation, body, probability = (np.zeros(len(each)) for each in (ROTATION_COLUMNS, BODY_COLUMNS, OBJECT_COLUMNS))
-    rotation[:CASES] = body[:CASES] = case.ravel()
+    rotation[:CASES] = body[:CASES] = body[CASES : 2 * CASES] = case.ravel()
     rotation[ROTATION_COLUMNS.index("share in neighbours")] = -3.0
     rotation[ROTATION_COLUMNS.index("share below the floor")] = -3.0
     probability[OBJECT_COLUMNS.index("log-odds of the pose")] = 1.0
-    return BeliefWeights(rotation, body, probability)
+    return BeliefWeights(*map(Scorer.of_weights, (rotation, body, probability)))
 
 
 @pytest.fixture(scope="module")

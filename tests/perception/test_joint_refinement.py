@@ -128,12 +128,12 @@ def test_a_memo_computes_each_row_once_until_it_is_not_asked_for():
 def test_rounding_moves_a_pose_little_and_near_poses_alike(seed):
     rng = np.random.default_rng(seed)
     T = make_transform(Rotation.random(5, rng=rng).as_matrix(), rng.uniform(-0.3, 0.3, (5, 3)))
-    rounded, keys = round_poses(T)
+    rounded, keys = round_poses(T, 0.001)
     assert np.abs(rounded[:, :3, 3] - T[:, :3, 3]).max() <= 0.5e-3 + 1e-12
     assert np.degrees(rotation_angle(rounded[:, :3, :3], T[:, :3, :3])).max() < 0.5
     near = T.copy()
     near[:, :3, 3] = rounded[:, :3, 3] + rng.uniform(-4e-4, 4e-4, (5, 3))
-    assert round_poses(near)[1] == keys
+    assert round_poses(near, 0.001)[1] == keys
 
 
 def brute_force_equations(T, model, samples, view, gate):
@@ -169,7 +169,7 @@ def test_equations_are_those_of_brute_force(mug, views_of_mug):
 
 
 def test_refinement_finds_the_pose_and_more_views_find_it_better(mug, views_of_mug):
-    refinement = BodyRefinement(ambiguity_of(mug).all_samples, iterations=5)
+    refinement = BodyRefinement(ambiguity_of(mug).all_samples, 5 * (0.008,) + 5 * (0.004,), 0.001)
     rng, starts = np.random.default_rng(1), []
     for _ in range(8):
         turn = Rotation.from_rotvec(rng.normal(0, 0.04, 3)).as_matrix()
@@ -182,7 +182,7 @@ def test_refinement_finds_the_pose_and_more_views_find_it_better(mug, views_of_m
 
 
 def test_what_is_remembered_changes_nothing(mug, views_of_mug):
-    refinement = BodyRefinement(ambiguity_of(mug).body_samples)
+    refinement = BodyRefinement(ambiguity_of(mug).body_samples, (0.008, 0.004), 0.002)
     T = POSE @ make_transform(np.eye(3), [0.002, 0.001, 0.0])
     fresh = refinement.refine(T[None], [(view, Memo()) for view in views_of_mug])
     used = [(view, Memo()) for view in views_of_mug]
@@ -192,7 +192,7 @@ def test_what_is_remembered_changes_nothing(mug, views_of_mug):
 
 def test_a_pose_without_measurements_stays(mug, views_of_mug):
     far = make_transform(np.eye(3), [0.0, 0.0, 0.6])[None]
-    refined = BodyRefinement(ambiguity_of(mug).body_samples).refine(far, [(views_of_mug[0], Memo())])
+    refined = BodyRefinement(ambiguity_of(mug).body_samples, (0.008,), 0.001).refine(far, [(views_of_mug[0], Memo())])
     np.testing.assert_array_equal(refined, far)
 
 

@@ -1,6 +1,6 @@
 """Candidates for the bodies in a scene: one for each cluster of hypotheses, and its near-symmetric twins."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,10 @@ class BodyCandidates:
     place: np.ndarray
     evidence: np.ndarray
     twin: np.ndarray
+
+    def take(self, index: np.ndarray) -> "BodyCandidates":
+        """The candidates at ``index``, in that order."""
+        return BodyCandidates(self.T_world_object[index], self.place[index], self.evidence[index], self.twin[index])
 
     def heads(self) -> np.ndarray:
         """(places,) index of the candidate with the most evidence at each place."""
@@ -97,4 +101,4 @@ def merge_duplicates(candidates: BodyCandidates, ambiguity: Ambiguity) -> BodyCa
             evidence[same[0]] += evidence[index]
         else:
             kept.append(index)
-    return BodyCandidates(T[kept], place[kept], evidence[kept], candidates.twin[kept])
+    return replace(candidates, evidence=evidence).take(np.array(kept, np.intp))

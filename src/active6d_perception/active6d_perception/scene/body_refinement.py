@@ -35,12 +35,12 @@ class BodyRefinement:
 
     Args:
         samples: of the part of the surface to align.
-        gates: largest distance of a pair in each stage, metres.
-        iterations: per stage.
+        gates: largest distance of a pair in each step, metres.
+        lattice: step of the lattice, metres; a finer one gives finer poses, a coarser one remembers more.
     """
 
-    def __init__(self, samples: VisibleSamples, gates: tuple[float, ...] = (0.008, 0.004), iterations: int = 3) -> None:
-        self._samples, self._gates, self._iterations = samples, gates, iterations
+    def __init__(self, samples: VisibleSamples, gates: tuple[float, ...], lattice: float) -> None:
+        self._samples, self._gates, self._lattice = samples, gates, lattice
 
     def refine(self, T_world_object: np.ndarray, views: Sequence[tuple[MeasuredView, Memo]]) -> np.ndarray:
         """Refine (k, 4, 4) poses, metres, over views with what is remembered of each.
@@ -50,12 +50,11 @@ class BodyRefinement:
         """
         T = np.array(T_world_object, float)
         for gate in self._gates:
-            for _ in range(self._iterations):
-                rounded, keys = round_poses(T)
-                total = np.zeros((len(T), _COLUMNS))
-                for view, memo in views:
-                    total += self._equations(rounded, keys, view, memo, gate)
-                T = _step(T, rounded, total)
+            rounded, keys = round_poses(T, self._lattice)
+            total = np.zeros((len(T), _COLUMNS))
+            for view, memo in views:
+                total += self._equations(rounded, keys, view, memo, gate)
+            T = _step(T, rounded, total)
         return T
 
     def _equations(

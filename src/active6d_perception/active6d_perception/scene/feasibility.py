@@ -10,6 +10,8 @@ from active6d_perception.scene.solid import Solid, signed_distance
 _INTO_CONTAINER, _INTO_NEIGHBOUR = 0.003, 0.0015
 #: Columns of :func:`against_container`.
 CONTAINER_COLUMNS = ("share below the floor", "lowest height", "share beyond a wall", "farthest beyond", "mean height")
+# Points farther than this from a solid neither touch it nor overlap with it, metres.
+_NEAR = 0.005
 #: Columns of :func:`against_neighbour`.
 NEIGHBOUR_COLUMNS = ("share inside", "least distance")
 #: Distance to a neighbour that is not near, metres.
@@ -67,20 +69,28 @@ def against_neighbour(
 
     Returns:
         (k, r, 2): the share of the points more than 1.5 mm inside of the neighbour, and the least signed distance from
-        it, at most 50 mm, metres.
+        it, metres; those farther than 5 mm may be given as 50 mm.
     """
     result = np.zeros((len(T_world_object), len(rotations), 2))
     result[:, :, 1] = FREE
+    reach = solid.reach + _NEAR
+    middle, radius = _ball_around(points)
     for k in range(len(T_world_object)):
         N = T_world_neighbour[k]
         for r in range(len(rotations)):
             T, row = T_world_object[k] @ rotations[r], result[k, r]
+            apart = 0.0
+            for axis in range(3):
+                there = T[axis, 0] * middle[0] + T[axis, 1] * middle[1] + T[axis, 2] * middle[2] + T[axis, 3]
+                apart += (there - N[axis, 3]) ** 2
+            if apart > (reach + radius) ** 2:
+                continue
             for p in range(len(points)):
                 a, b, c = points[p, 0], points[p, 1], points[p, 2]
                 x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3] - N[0, 3]
                 y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3] - N[1, 3]
                 z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - N[2, 3]
-                if x * x + y * y + z * z > solid.reach * solid.reach:
+                if x * x + y * y + z * z > reach * reach:
                     continue
                 distance = signed_distance(
                     x * N[0, 0] + y * N[1, 0] + z * N[2, 0],
@@ -92,3 +102,37 @@ def against_neighbour(
                 row[1] = min(row[1], distance)
             row[0] /= max(len(points), 1)
     return result
+
+
+@compiled
+def combine_neighbours(pairs: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:
+    """Combine what :func:`against_neighbour` found for pairs of an object and one of its neighbours.
+
+    Args:
+        pairs: (m, r, 2).
+        own: (m,) index of each pair's object.
+        count: number of objects.
+
+    Returns:
+        (count, r, 2): the sum of the shares, at most 1, and the least distance, metres.
+    """
+    result = np.zeros((count, pairs.shape[1], 2))
+    result[:, :, 1] = FREE
+    for m in range(len(pairs)):
+        for r in range(pairs.shape[1]):
+            row = result[own[m], r]
+            row[0] = min(row[0] + pairs[m, r, 0], 1.0)
+            row[1] = min(row[1], pairs[m, r, 1])
+    return result
+
+
+@compiled
+def _ball_around(points: np.ndarray) -> tuple[tuple[float, float, float], float]:
+    """Centre and radius of a ball with all (p, 3) points."""
+    x, y, z = 0.0, 0.0, 0.0
+    for p in range(len(points)):
+        x, y, z = x + points[p, 0] / len(points), y + points[p, 1] / len(points), z + points[p, 2] / len(points)
+    square = 0.0
+    for p in range(len(points)):
+        square = max(square, (points[p, 0] - x) ** 2 + (points[p, 1] - y) ** 2 + (points[p, 2] - z) ** 2)
+    return (x, y, z), np.sqrt(square)

@@ -11,41 +11,58 @@ remembered (:mod:`.memo`), so another view costs its own part.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.metrics import DETECTION_FRACTION
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, transform_points
+from active6d_perception.model.visible_samples import VisibleSamples
 from active6d_perception.scene.ambiguity import Ambiguity, ambiguity_of
 from active6d_perception.scene.belief_weights import BeliefWeights, belief_path, load_belief
 from active6d_perception.scene.body_candidates import BodyCandidates, gather_candidates, merge_duplicates
 from active6d_perception.scene.body_refinement import BodyRefinement
 from active6d_perception.scene.clustering import cluster
 from active6d_perception.scene.expected_visibility import Tray
-from active6d_perception.scene.feasibility import FREE, against_container, against_neighbour
+from active6d_perception.scene.feasibility import against_container, against_neighbour, combine_neighbours
 from active6d_perception.scene.fusion import FusionParameters, preference, project_features
 from active6d_perception.scene.hypothesis_table import HypothesisTable, confidence
 from active6d_perception.scene.measured_cases import CASES, count_cases
 from active6d_perception.scene.measured_view import MeasuredView, measure_view
 from active6d_perception.scene.memo import Memo
-from active6d_perception.scene.object_probability import describe_objects, object_probability
+from active6d_perception.scene.object_probability import OBJECT_COLUMNS, describe_objects
 from active6d_perception.scene.pose_lattice import round_poses
 from active6d_perception.scene.rotation_belief import PlaceBeliefs, decide, posterior
-from active6d_perception.scene.scene_evidence import SceneEvidence
+from active6d_perception.scene.scene_evidence import BodyEvidence, SceneEvidence
 from active6d_perception.suppression import suppress_neighbours
 
 # An instance whose body's middle is nearer than this to a candidate's is the candidate's own, diameters.
 _OWN = 0.25
 # Bodies whose middles are farther apart than this do not touch, diameters.
 _BESIDE = 1.3
-_LAST_GATES = (0.004,)  # metres, of refining the whole object
+# Refinement, metres: gates of the steps, and the lattice. Bodies are many and only compared; what is reported is finer.
+_BODY_GATES, _BODY_LATTICE = (0.008, 0.004, 0.004), 0.002
+_WHOLE_GATES, _WHOLE_LATTICE = (0.004, 0.004, 0.004), 0.001
+# A body whose log-odds are so much below the best at its place is not looked at further.
+_HOPELESS = 12.0
+# Evidence is taken at poses on this lattice, metres.
+_LATTICE = 0.001
 
 
 @dataclass(frozen=True, eq=False)
 class _SeenView:
     measured: MeasuredView
     memo: Memo
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Part of the surface: its name, rotations (r, 4, 4) to try, and points (p, 3) in the object frame, metres."""
+
+    name: str
+    rotations: np.ndarray
+    points: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +100,8 @@ class JointFusion:
         self.weights = weights or load_belief(belief_path(model.name))
         self._tray = tray or Tray.for_model(model)
         self._known = HypothesisTable(self.ambiguity.body_distance.between)
-        self._bodies = BodyRefinement(self.ambiguity.body_samples)
-        self._whole = BodyRefinement(self.ambiguity.all_samples, _LAST_GATES)
+        self._bodies = BodyRefinement(self.ambiguity.body_samples, _BODY_GATES, _BODY_LATTICE)
+        self._whole = BodyRefinement(self.ambiguity.all_samples, _WHOLE_GATES, _WHOLE_LATTICE)
         self.reset()
 
     @property
@@ -124,33 +141,37 @@ class JointFusion:
         return True
 
     def evidence(self) -> SceneEvidence:
-        """What all views say of every candidate."""
-        order = self._order()
-        candidates = self._candidates(order)
-        ambiguity, identity = self.ambiguity, np.eye(4)[None]
-        rounded, keys = round_poses(candidates.T_world_object)
-        heads = candidates.heads()
-
-        def container(rotations: np.ndarray, points: np.ndarray) -> np.ndarray:
-            kind = "container", len(points)
-            return self._feasible.rows(
-                [(*kind, key) for key in keys],
-                lambda missing: against_container(rounded[missing], rotations, points, self._tray),
-            )
-
+        """What all views say of every candidate that its body does not rule out."""
+        ambiguity, whole = self.ambiguity, _Part("body", np.eye(4)[None], self.ambiguity.body_points)
+        candidates = self._candidates(self._order())
+        heads = round_poses(candidates.take(candidates.heads()).T_world_object, _LATTICE)
+        bodies = BodyEvidence(
+            candidates,
+            self._count(candidates, "body")[:, 0],
+            self._count(candidates, "twin")[:, 0],
+            self._in_container(candidates, whole)[:, 0],
+            self._among_neighbours(candidates, heads, whole)[:, 0],
+        )
+        bodies = bodies.take(self._possible(bodies))
+        candidates = bodies.candidates
+        telling = _Part("telling", ambiguity.rotations, ambiguity.telling_points)
         evidence = SceneEvidence(
-            candidates=candidates,
-            telling=self._count("telling", rounded, keys),
-            body=self._count("body", rounded, keys)[:, 0],
-            container=container(ambiguity.rotations, ambiguity.telling_points),
-            body_container=container(identity, ambiguity.body_points)[:, 0],
-            neighbours=self._overlaps(candidates, rounded, keys, heads, ambiguity.rotations, ambiguity.telling_points),
-            body_neighbours=self._overlaps(candidates, rounded, keys, heads, identity, ambiguity.body_points)[:, 0],
-            diameter=ambiguity.diameter,
+            bodies,
+            self._count(candidates, "telling"),
+            self._in_container(candidates, telling),
+            self._among_neighbours(candidates, heads, telling),
+            ambiguity.diameter,
         )
         for memo in (self._feasible, *(view.memo for view in self._views.values())):
             memo.sweep()
         return evidence
+
+    def _possible(self, bodies: BodyEvidence) -> np.ndarray:
+        """Indices of the candidates that have a chance beside the best body at their place."""
+        log_odds, place = self.weights.body(bodies.columns()), bodies.candidates.place
+        best = np.full(place.max(initial=-1) + 1, -np.inf)
+        np.maximum.at(best, place, log_odds)
+        return np.flatnonzero(log_odds > best[place] - _HOPELESS)
 
     def _order(self) -> np.ndarray:
         known = self._known
@@ -172,14 +193,14 @@ class JointFusion:
         )
         return merge_duplicates(refined, ambiguity)
 
-    def _count(self, part: str, rounded: np.ndarray, keys: list[bytes]) -> np.ndarray:
-        """(K, r or 1, CASES) counts over all views."""
+    def _count(self, candidates: BodyCandidates, part: str) -> np.ndarray:
+        """(K, r or 1, CASES) counts over all views, of the samples that the ambiguity has of a part."""
         ambiguity = self.ambiguity
-        telling = part == "telling"
-        samples = ambiguity.telling_samples if telling else ambiguity.body_samples
-        rotations = ambiguity.rotations if telling else np.eye(4)[None]
+        rounded, keys = round_poses(candidates.T_world_object, _LATTICE)
+        samples: VisibleSamples = getattr(ambiguity, f"{part}_samples")
+        rotations = ambiguity.rotations if part == "telling" else np.eye(4)[None]
         total = np.zeros((len(keys), len(rotations), CASES), np.int64)
-        if telling and len(rotations) == 1:
+        if not samples.number.any():
             return total
         for view in self._views.values():
 
@@ -190,43 +211,37 @@ class JointFusion:
             total += view.memo.rows([(part, key) for key in keys], compute)
         return total
 
-    def _overlaps(
-        self,
-        candidates: BodyCandidates,
-        rounded: np.ndarray,
-        keys: list[bytes],
-        heads: np.ndarray,
-        rotations: np.ndarray,
-        points: np.ndarray,
-    ) -> np.ndarray:
-        """(K, r, 2) overlap of each candidate's points with the most evident bodies of other places."""
-        ambiguity, solid = self.ambiguity, self.ambiguity.solid
-        total = np.zeros((len(keys), len(rotations), 2))
-        total[..., 1] = np.inf
-        middles = transform_points(rounded, ambiguity.middle[None])[:, 0]
-        apart = np.linalg.norm(middles[:, None] - middles[heads], axis=-1)
-        other = candidates.place[:, None] != candidates.place[heads]
-        own, neighbour = np.nonzero(other & (apart < _BESIDE * ambiguity.diameter))
-        neighbour = heads[neighbour]
+    def _in_container(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:
+        """(K, r, 5), see :func:`.against_container`."""
+        rounded, keys = round_poses(candidates.T_world_object, _LATTICE)
 
         def compute(missing: np.ndarray) -> np.ndarray:
-            pair = own[missing], neighbour[missing]
-            return against_neighbour(rounded[pair[0]], rounded[pair[1]], rotations, points, solid)
+            return against_container(rounded[missing], part.rotations, part.points, self._tray)
 
-        rows = self._feasible.rows(
-            [(len(points), keys[a], keys[b]) for a, b in zip(own, neighbour, strict=True)], compute
-        )
-        if len(own):
-            np.add.at(total[..., 0], own, rows[..., 0])
-            np.minimum.at(total[..., 1], own, rows[..., 1])
-        total[..., 0] = np.minimum(total[..., 0], 1.0)
-        total[..., 1] = np.minimum(total[..., 1], FREE)
-        return total
+        return self._feasible.rows([(part.name, key) for key in keys], compute)
+
+    def _among_neighbours(
+        self, candidates: BodyCandidates, heads: tuple[np.ndarray, list[bytes]], part: _Part
+    ) -> np.ndarray:
+        """(K, r, 2) overlap with the most evident bodies of other places, given as rounded poses and their keys."""
+        ambiguity, solid = self.ambiguity, self.ambiguity.solid
+        rounded, keys = round_poses(candidates.T_world_object, _LATTICE)
+        middles, others = (transform_points(T, ambiguity.middle[None])[:, 0] for T in (rounded, heads[0]))
+        apart = np.linalg.norm(middles[:, None] - others, axis=-1)
+        other = candidates.place[:, None] != np.arange(len(others))
+        own, neighbour = np.nonzero(other & (apart < _BESIDE * ambiguity.diameter))
+
+        def compute(missing: np.ndarray) -> np.ndarray:
+            pair = rounded[own[missing]], heads[0][neighbour[missing]]
+            return against_neighbour(*pair, part.rotations, part.points, solid)
+
+        pairs = [(part.name, keys[a], heads[1][b]) for a, b in zip(own, neighbour, strict=True)]
+        return combine_neighbours(self._feasible.rows(pairs, compute), own, len(keys))
 
     def believe(self, evidence: SceneEvidence) -> PlaceBeliefs:
         """The most probable pose at each place."""
-        log_odds = evidence.of_rotations() @ self.weights.rotation
-        log_odds += (evidence.of_bodies() @ self.weights.body)[:, None]
+        log_odds = self.weights.rotation(evidence.columns())
+        log_odds += self.weights.body(evidence.bodies.columns())[:, None]
         place = evidence.candidates.place
         tolerance = DETECTION_FRACTION * self.ambiguity.diameter
         return decide(posterior(log_odds, place), place, self.ambiguity.rotation_errors, tolerance)
@@ -241,7 +256,7 @@ class JointFusion:
         """The objects of all views so far with what is known of them; arguments as for :meth:`objects`."""
         order = self._order()
         if not len(order):
-            return JointObjects(SceneObjects.empty(), np.zeros((0, len(self.weights.probability))))
+            return JointObjects(SceneObjects.empty(), np.zeros((0, len(OBJECT_COLUMNS))))
         evidence = self.evidence()
         beliefs = self.believe(evidence)
         T = self.poses(evidence, beliefs)
@@ -249,8 +264,9 @@ class JointFusion:
         table, stamps, hypotheses = known.table[order], known.stamp[order], known.T_world_object[order]
         members = self._members(T, hypotheses)
         description = describe_objects(evidence, beliefs, members, table[:, 1], stamps)
-        probability = object_probability(description, self.weights.probability)
+        probability = expit(self.weights.probability(description))
         first = np.argsort(-probability, kind="stable")
+        first = first[probability[first] >= self.parameters.least_probability]
         apart_enough = self.parameters.exclusion * ambiguity.diameter
         kept = first[suppress_neighbours(T[first, :3, 3][None], np.ones((1, len(first)), bool), apart_enough)[0]]
         box, depth = project_features(ambiguity.views, invert(T_world_camera) @ T[kept], camera)

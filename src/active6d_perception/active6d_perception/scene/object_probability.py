@@ -1,7 +1,6 @@
 """The probability that a fused object is right, from all that is known of it."""
 
 import numpy as np
-from scipy.special import expit
 
 from active6d_perception.scene.measured_cases import FITTING, LOOKED_THROUGH, PER_PIXEL, WHAT, WHOSE
 from active6d_perception.scene.rotation_belief import PlaceBeliefs
@@ -45,9 +44,9 @@ def describe_objects(
         (n, columns) float, about one in size; see :data:`OBJECT_COLUMNS`.
     """
     chosen = beliefs.candidate
-    fitting, through, elsewhere, hidden = (pixels[chosen] for pixels in evidence.body_pixels())
+    fitting, through, elsewhere, hidden = (pixels[chosen] for pixels in evidence.bodies.pixels())
     seen = np.maximum(fitting + through + elsewhere, 1)
-    cases = evidence.body[chosen].reshape(-1, WHAT, WHOSE) / PER_PIXEL
+    cases = evidence.bodies.body[chosen].reshape(-1, WHAT, WHOSE) / PER_PIXEL
     telling = evidence.telling[chosen, beliefs.rotation].reshape(-1, WHAT, WHOSE).sum(axis=2) / PER_PIXEL
     views = np.unique(stamp)
     support = np.array([len(np.unique(stamp[own])) for own in members], float)
@@ -67,14 +66,9 @@ def describe_objects(
         cases[:, FITTING, 1] / np.maximum(fitting, 1),
         np.log1p(fitting),
         np.log1p(hidden),
-        evidence.body_neighbours[chosen, 0],
-        evidence.body_container[chosen, 0],
+        evidence.bodies.neighbours[chosen, 0],
+        evidence.bodies.container[chosen, 0],
         0.3 * np.sqrt(telling[:, FITTING]),
         0.3 * np.sqrt(telling[:, LOOKED_THROUGH]),
     ]
     return np.stack(columns, axis=1)
-
-
-def object_probability(description: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(n,) probability that an object's ADD is below 10 % of the diameter, from (n, c) columns and (c,) weights."""
-    return expit(description @ weights)

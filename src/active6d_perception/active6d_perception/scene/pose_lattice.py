@@ -4,14 +4,18 @@ import numpy as np
 
 from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
 
-# Poses are rounded by at most 0.5 mm along each axis, and by at most half a degree.
-_METRES = 0.001
-_QUATERNION = 1 / 256
+# Steps of a quaternion per metre: rotations are rounded by half a degree where positions are by 0.5 mm.
+_QUATERNION = 1 / 0.256
 
 
-def round_poses(T: np.ndarray) -> tuple[np.ndarray, list[bytes]]:
-    """Round (k, 4, 4) poses in metres: (k, 4, 4) poses on a lattice, and a key of each."""
-    quaternion = np.rint(quaternion_from_transform(T) / _QUATERNION) if len(T) else np.zeros((0, 4))
-    steps = np.concatenate([np.rint(T[:, :3, 3] / _METRES), quaternion], axis=1).astype(np.int32)
-    rounded = transform_from_quaternion(steps[:, 3:] * _QUATERNION, steps[:, :3] * _METRES) if len(T) else np.array(T)
-    return rounded, [row.tobytes() for row in steps]
+def round_poses(T: np.ndarray, step: float) -> tuple[np.ndarray, list[bytes]]:
+    """Round (k, 4, 4) poses in metres: (k, 4, 4) poses on a lattice, and a key of each.
+
+    Positions are multiples of ``step``, metres.
+    """
+    if not len(T):
+        return np.array(T), []
+    quaternion_step = step * _QUATERNION
+    quaternion = quaternion_from_transform(T) / quaternion_step
+    steps = np.rint(np.concatenate([T[:, :3, 3] / step, quaternion], axis=1)).astype(np.int32)
+    return transform_from_quaternion(steps[:, 3:] * quaternion_step, steps[:, :3] * step), [s.tobytes() for s in steps]

@@ -24,7 +24,7 @@ class Solid(NamedTuple):
     distance: np.ndarray
     """(nx, ny, nz) float32 metres, negative inside"""
     reach: float
-    """no point farther than this from the object's origin is in the grid, metres"""
+    """no solid point is farther than this from the object's origin, metres"""
 
 
 def solid_of(model: ObjectModel, rotations: np.ndarray) -> Solid:
@@ -46,7 +46,8 @@ def solid_of(model: ObjectModel, rotations: np.ndarray) -> Solid:
     for T in invert(rotations):
         rotated = o3d.core.Tensor(transform_points(T, corners).astype(np.float32))
         distance = np.maximum(distance, scene.compute_signed_distance(rotated).numpy())
-    reach = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(corners[-1]))))
+    inside = corners[distance <= 0]
+    reach = float(np.linalg.norm(inside, axis=1).max(initial=0.0)) + cell
     return Solid(low, cell, distance.reshape(shape), reach)
 
 

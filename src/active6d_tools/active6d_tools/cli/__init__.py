@@ -26,6 +26,7 @@ from active6d_tools.cli import (
     report,
     scenes,
     train_estimator,
+    train_fusion,
     train_policy,
 )
 
@@ -127,6 +128,7 @@ app.add_typer(scenes.app, name="scenes")
 benchmark.app.command(cls=PartsCommand)(benchmark_estimator.estimator)
 benchmark.app.command(cls=PartsCommand)(benchmark.pipeline)
 app.add_typer(benchmark.app, name="benchmark")
+train_estimator.app.command()(train_fusion.fusion)
 train_estimator.app.command()(train_policy.policy)
 app.add_typer(train_estimator.app, name="train")
 

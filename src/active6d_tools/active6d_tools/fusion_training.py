@@ -1,0 +1,153 @@
+"""Fits the weights of fusion: episodes on stored scenes with the deployed estimator, scored by the true poses."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+from active6d_core.camera import View
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.metrics import DETECTION_FRACTION, e_add
+from active6d_core.object_model import load_object
+from active6d_core.registry import AUTOMATIC
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.estimators.registry import create_estimator
+from active6d_perception.scene.belief_training import LabelledPlaces, fit_belief, fit_probability, label_places
+from active6d_perception.scene.belief_weights import BeliefWeights
+from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.verification import Verifier
+from active6d_sim.rendering.random_sensor import sensor_of
+from active6d_sim.rendering.simulator import NANOSECONDS, Simulator
+from active6d_sim.scenes.scene_store import SPLITS, find_scene, scene_path
+
+#: Scenes to fit the belief to, and scenes to fit the probability to, which are others: a belief is too sure of the
+#: scenes that it was fitted to.
+BELIEF_SPLIT, PROBABILITY_SPLITS = "train", ("val", "wild_val")
+# Views per episode, in turn.
+_VIEWS = (6, 2, 6, 3, 6, 1, 6, 10, 6, 4, 6, 20)
+_RING = np.radians(45.0)
+
+
+def fit_fusion(
+    objects: Sequence[str],
+    *,
+    episodes: int = 24,
+    scenes: int | None = None,
+    estimator: str = AUTOMATIC,
+    workers: int = 1,
+    seed: int = 0,
+    on_scene: Callable[[str], None] = lambda name: None,
+) -> tuple[BeliefWeights, dict[str, Any]]:
+    """Fit weights to the scenes of one or several objects.
+
+    Args:
+        objects: their names.
+        episodes: per scene.
+        scenes: largest number of scenes per split; None for all.
+        estimator: name of the deployed one.
+        workers: processes.
+        seed: of views and of the sensor's noise.
+        on_scene: called with the name of each scene that is done.
+
+    Returns:
+        The weights, and what was measured: numbers of places and of objects, and the share of right objects.
+    """
+    common: dict[str, Any] = {"episodes": episodes, "estimator": estimator, "seed": seed}
+    labelled, described = [], []
+    for name, found in _in_processes(partial(label_scene, **common), _names(objects, (BELIEF_SPLIT,), scenes), workers):
+        labelled += found
+        on_scene(name)
+    rotation, body = fit_belief(labelled, seed)
+    weights = replace(BeliefWeights.indifferent(), rotation=rotation, body=body)
+    describe = partial(describe_scene, weights=weights, **common)
+    for name, rows in _in_processes(describe, _names(objects, PROBABILITY_SPLITS, scenes), workers):
+        described.append(rows)
+        on_scene(name)
+    table = np.concatenate(described)
+    right = table[:, -1] > 0
+    measured = {
+        "places": int(sum(episode.place.max(initial=-1) + 1 for episode in labelled)),
+        "fused_objects": len(right),
+        "right": float(right.mean()),
+    }
+    provenance = {"objects": list(objects), **common, **measured}
+    return BeliefWeights(rotation, body, fit_probability(table[:, :-1], right), provenance), measured
+
+
+def count_scenes(objects: Sequence[str], scenes: int | None) -> int:
+    """How many scenes :func:`fit_fusion` looks at."""
+    return len(_names(objects, (BELIEF_SPLIT, *PROBABILITY_SPLITS), scenes))
+
+
+def _names(objects: Sequence[str], splits: Sequence[str], scenes: int | None) -> list[str]:
+    """Names of the stored scenes; an object need not have wild ones."""
+    return [
+        f"{name}/{split}/{index}"
+        for name in objects
+        for split in splits
+        if scene_path(name, split, 0).is_file() or not split.startswith("wild")
+        for index in range(min(scenes or SPLITS[split], SPLITS[split]))
+    ]
+
+
+def _in_processes(work: Callable[[str], Any], names: Sequence[str], workers: int) -> Iterator[tuple[str, Any]]:
+    """Results in the order of the names, so that they do not depend on the speed of the processes."""
+    # Spawned, because a forked child inherits locks of threads that do not exist in it (Embree, BLAS).
+    with ProcessPoolExecutor(max(1, min(workers, len(names))), mp_context=get_context("spawn")) as pool:
+        yield from zip(names, pool.map(work, names), strict=True)
+
+
+def label_scene(name: str, *, episodes: int, estimator: str, seed: int) -> list[LabelledPlaces]:
+    """The places of each episode on a scene, with their right poses; runs in its own process."""
+    weights, labelled = BeliefWeights.indifferent(), []
+    for fusion, _, T_world_object in _episodes(name, weights, episodes, estimator, seed):
+        labelled.append(label_places(fusion.evidence(), fusion.ambiguity.model, T_world_object))
+    return labelled
+
+
+def describe_scene(name: str, *, weights: BeliefWeights, episodes: int, estimator: str, seed: int) -> np.ndarray:
+    """(n, columns + 1) descriptions of the objects of each episode on a scene, and 1 for those that are right."""
+    rows = []
+    for fusion, last, T_world_object in _episodes(name, weights, episodes, estimator, seed):
+        model = fusion.ambiguity.model
+        described = fusion.describe(last.stamp, last.T_world_camera, last.camera)
+        limit = DETECTION_FRACTION * model.diameter
+        errors = e_add(model, described.objects.T_world_object[:, None], T_world_object, cutoff=limit)
+        right = (errors < limit).any(axis=1)
+        rows.append(np.column_stack([described.description, right]))
+    return np.concatenate(rows)
+
+
+def _episodes(
+    name: str, weights: BeliefWeights, episodes: int, estimator: str, seed: int
+) -> Iterator[tuple[JointFusion, View, np.ndarray]]:
+    """Fusion after each episode's views, its last view, and the true poses."""
+    model, sphere = load_object(name.split("/")[0]), ViewSphere()
+    scene = find_scene(model.name, name, 0)
+    simulator = Simulator(scene, noise=sensor_of(AUTOMATIC, model, scene), seed=seed)
+    find, verifier = create_estimator(estimator, model), Verifier(model)
+    seen: dict[int, tuple[View, Hypotheses, np.ndarray]] = {}
+    rng = np.random.default_rng([seed, scene.seed])
+    for episode in range(episodes):
+        fusion = JointFusion(model, weights=weights)
+        for index in draw_views(sphere, _VIEWS[episode % len(_VIEWS)], ring=episode % 4 == 0, rng=rng):
+            if index not in seen:
+                view = simulator.capture(sphere.pose(sphere.positions[index]), (index + 1) * NANOSECONDS)
+                hypotheses = find.estimate(view)
+                seen[index] = view, hypotheses, verifier.score(view.depth, view.camera, hypotheses)
+            view, hypotheses, verification = seen[index]
+            fusion.add_view(view.stamp, view.T_world_camera, hypotheses, verification, view.depth, view.camera)
+        yield fusion, view, scene.T_world_object
+
+
+def draw_views(sphere: ViewSphere, count: int, *, ring: bool, rng: np.random.Generator) -> list[int]:
+    """Draw different views of the grid: at random, or on a ring at 45 degrees as far apart as possible."""
+    if not ring:
+        return rng.choice(len(sphere), count, replace=False).tolist()
+    start = rng.uniform(0, 2 * np.pi)
+    azimuths = start + np.arange(count) * 2 * np.pi / count
+    return list(dict.fromkeys(int(sphere.nearest(sphere.position(azimuth, _RING))) for azimuth in azimuths))

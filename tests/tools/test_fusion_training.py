@@ -1,0 +1,71 @@
+"""Fitting fusion to scenes: which views are drawn, and what is learned from an episode."""
+
+import numpy as np
+import pytest
+from hand_made_scenes import make_scene, three_mugs
+
+from active6d_core.metrics import DETECTION_FRACTION, e_add
+from active6d_core.object_model import load_object
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.scene.belief_weights import BeliefWeights
+from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.object_probability import OBJECT_COLUMNS
+from active6d_tools import fusion_training
+from active6d_tools.fusion_training import count_scenes, describe_scene, draw_views, fit_fusion, label_scene
+
+SPHERE = ViewSphere()
+
+
+def test_views_of_a_ring_are_spread_and_others_are_drawn():
+    rng = np.random.default_rng(0)
+    ring = SPHERE.positions[draw_views(SPHERE, 5, ring=True, rng=rng)]
+    angles = SPHERE.angles(ring)
+    np.testing.assert_allclose(np.degrees(angles[:, 1]), 45, atol=1e-6)
+    apart = np.diff(np.sort(angles[:, 0] % (2 * np.pi)))
+    assert np.degrees(apart).min() > 50
+    drawn = draw_views(SPHERE, 20, ring=False, rng=rng)
+    assert len(set(drawn)) == 20
+    assert drawn != draw_views(SPHERE, 20, ring=False, rng=rng)
+
+
+def test_scenes_are_those_of_the_splits():
+    assert count_scenes(["mug"], None) == 24 + 6 + 6
+    assert count_scenes(["mug", "bunny"], 2) == 2 * 3 * 2
+
+
+@pytest.fixture
+def scene_folder(tmp_path, monkeypatch):
+    """Hand-made scenes of the first of each split."""
+    monkeypatch.setenv("ACTIVE6D_SCENE_PATH", str(tmp_path))
+    mugs = three_mugs()
+    (tmp_path / "mug").mkdir()
+    for split, seed in (("train", 1), ("val", 2), ("wild_val", 3)):
+        scene = make_scene(mugs.T_world_object, mugs.bin, f"mug/{split}/0", seed)
+        scene.save(tmp_path / "mug" / f"{split}_00.npz")
+    return mugs
+
+
+@pytest.mark.slow
+def test_weights_are_fitted_to_scenes(scene_folder, monkeypatch):
+    monkeypatch.setattr(fusion_training, "_VIEWS", (2, 3))
+    labelled = label_scene("mug/train/0", episodes=2, estimator="auto", seed=0)
+    again = label_scene("mug/train/0", episodes=2, estimator="auto", seed=0)
+    assert [len(each.place) for each in labelled] == [len(each.place) for each in again]
+    assert all(set(each.place[each.right.any(axis=1)]) == set(each.place) for each in labelled)
+    rows = describe_scene("mug/val/0", weights=BeliefWeights.indifferent(), episodes=1, estimator="auto", seed=0)
+    assert rows.shape[1] == len(OBJECT_COLUMNS) + 1
+    assert set(rows[:, -1]) <= {0.0, 1.0}
+    names = []
+    # In this process: the scenes of the test are hand-made.
+    monkeypatch.setattr(fusion_training, "_in_processes", lambda work, names, workers: ((n, work(n)) for n in names))
+    weights, measured = fit_fusion(["mug"], episodes=2, scenes=1, on_scene=names.append)
+    assert names == ["mug/train/0", "mug/val/0", "mug/wild_val/0"]
+    assert measured["places"] >= 3
+    assert weights.provenance["objects"] == ["mug"]
+    episodes = fusion_training._episodes("mug/val/0", weights, 1, "auto", 7)
+    fusion, last, T_true = next(episodes)
+    assert isinstance(fusion, JointFusion)
+    objects = fusion.objects(last.stamp, last.T_world_camera, last.camera)
+    model = load_object("mug")
+    errors = e_add(model, objects.T_world_object[:, None], T_true).min(axis=0)
+    assert (errors < DETECTION_FRACTION * model.diameter).sum() >= 2
