@@ -336,3 +336,4 @@ def test_markers_colour_by_probability_and_clear_the_last_ones():
     clear, low, high = conversions.objects_to_markers(objects, "file:///mug.ply", 1, "world").markers
     assert clear.action == clear.DELETEALL
     assert (low.color.r, low.color.g, high.color.r, high.color.g) == (1.0, 0.0, 0.0, 1.0)
+    assert low.color.a < high.color.a

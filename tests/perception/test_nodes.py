@@ -1,5 +1,7 @@
 """The estimator and fusion nodes: what they publish, and that bad input is refused while they live on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -32,7 +34,11 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.nodes.hypothesis_fusion import HypothesisFusionNode
 from active6d_perception.nodes.pose_estimator import PoseEstimatorNode
+from active6d_perception.scene.belief_weights import BeliefWeights, Scorer, belief_file
+from active6d_perception.scene.expected_visibility import Tray
 from active6d_perception.scene.fusion import SceneFusion
+from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
 from active6d_perception.scene.verification import Verifier
 
@@ -252,6 +258,37 @@ def test_fusion_publishes_verified_objects(graph, fusion, seen, tmp_path):
     assert len(poses[0].poses) == 1
     assert markers[0].markers[1].mesh_resource == (tmp_path / "active6d/meshes/mug.stl").as_uri()
     assert (tmp_path / "active6d/meshes/mug.stl").stat().st_size > 1000
+
+
+def test_fusion_from_all_views_is_that_of_the_core(graph, seen, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path))
+    weights = replace(BeliefWeights.indifferent(), probability=Scorer.of_weights(np.full(len(OBJECT_COLUMNS), 0.1)))
+    weights.save(tmp_path / belief_file("mug"), "mug")
+    overrides = {"method": "all-views", "bin_width": 0.5, "wall_height": 0.0, "confirmed": 0.99}
+    graph.add(HypothesisFusionNode(context=graph.context, overrides=overrides))
+    objects, markers = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(MarkerArray, "objects/markers", True)
+    send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
+    graph.spin_until_filled([objects, markers])
+    depth, hypotheses = seen
+    model = load_object("mug")
+    T_world_camera = SPHERE.pose(SPHERE.positions[3])
+    core = JointFusion(model, weights=weights, tray=Tray(0.5, 0.0))
+    verification = Verifier(model).score(depth, CAMERA, hypotheses)
+    core.add_view(SECOND, T_world_camera, hypotheses, verification, depth, CAMERA)
+    expected = core.objects(SECOND, T_world_camera, CAMERA)
+    published = objects_from_cloud(objects[0], "world")
+    for name in ("T_world_object", "score", "probability", "entropy"):
+        np.testing.assert_allclose(getattr(published, name), getattr(expected, name), atol=1e-3, err_msg=name)
+    assert 0.5 < published.probability[0] < 0.99
+    assert markers[0].markers[1].color.a == pytest.approx(0.3)
+
+
+def test_weights_that_do_not_fit_are_named(graph, tmp_path, monkeypatch):
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path))
+    (tmp_path / belief_file("mug")).write_bytes(b"")
+    with pytest.raises(ValueError, match=r"no weights of fusion .*active6d train fusion"):
+        graph.add(HypothesisFusionNode(context=graph.context, overrides={"method": "all-views"}))
 
 
 def box_on_the_floor(stamp, left=60):

@@ -537,8 +537,13 @@ def latencies_from_diagnostics(message: DiagnosticArray) -> dict[str, float]:
 # Markers
 
 
-def objects_to_markers(objects: SceneObjects, mesh_uri: str, stamp: int, frame: str) -> MarkerArray:
-    """One mesh per object, from red (probability 0) to green (1), after one marker that clears the last ones."""
+def objects_to_markers(
+    objects: SceneObjects, mesh_uri: str, stamp: int, frame: str, confirmed: float = 0.5
+) -> MarkerArray:
+    """One mesh per object, from red (probability 0) to green (1), after one marker that clears the last ones.
+
+    Objects that are less probable than ``confirmed`` are transparent.
+    """
     header = make_header(stamp, frame)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
     # Copies share all that is alike: making a new Marker costs ten times as much.
@@ -550,6 +555,6 @@ def objects_to_markers(objects: SceneObjects, mesh_uri: str, stamp: int, frame: 
         marker.id = index
         marker.pose = pose
         green = float(np.clip(probability, 0.0, 1.0))
-        marker.color = ColorRGBA(r=1.0 - green, g=green, b=0.1, a=0.8)
+        marker.color = ColorRGBA(r=1.0 - green, g=green, b=0.1, a=0.8 if probability >= confirmed else 0.3)
         markers.append(marker)
     return MarkerArray(markers=markers)

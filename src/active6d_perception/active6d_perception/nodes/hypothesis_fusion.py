@@ -32,7 +32,9 @@ from active6d_core.ros.node import GraphNode
 from active6d_core.ros.optional_outputs import DetectionOutput
 from active6d_core.ros.runner import run_node
 from active6d_core.ros.view_inputs import ViewInputs
-from active6d_perception.scene.fusion import RANKINGS, FusionParameters, SceneFusion
+from active6d_perception.scene.expected_visibility import Tray
+from active6d_perception.scene.fusion import METHODS, RANKINGS, FusionParameters, SceneFusion
+from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
 from active6d_perception.scene.verification import Verifier
 
@@ -65,6 +67,33 @@ class HypothesisFusionNode(GraphNode):
 
     def _declare_fusion(self) -> None:
         usual = FusionParameters()
+        self.declare(
+            "method",
+            METHODS[0],
+            "what an object's pose follows from: the best hypothesis of one view, or the depth images of all views",
+            choices=METHODS,
+        )
+        self.declare(
+            "confirmed",
+            usual.confirmed,
+            "objects with at least this probability count; the others are drawn transparent",
+            minimum=0.0,
+            maximum=1.0,
+        )
+        self.declare(
+            "least_probability",
+            usual.least_probability,
+            "less probable objects are withdrawn; only by the method all-views",
+            minimum=0.0,
+            maximum=1.0,
+        )
+        self.declare("bin_width", 0.0, "between the bin's inner walls, metres; 0: that of the usual bin", minimum=0.0)
+        self.declare(
+            "wall_height",
+            -1.0,
+            "of the bin's walls above its floor at z = 0, metres; 0: an open table, -1: that of the usual bin",
+            minimum=-1.0,
+        )
         self.declare(
             "cut", usual.cut, "distance at which clusters are cut, as a fraction of the object's diameter", minimum=1e-3
         )
@@ -122,13 +151,20 @@ class HypothesisFusionNode(GraphNode):
         self._model = load_object(self.value("object"))
         parameters = FusionParameters(**{each.name: self.value(each.name) for each in fields(FusionParameters)})
         self._verifier = Verifier(self._model, self.value("epsilon"), self.value("samples"))
-        self._fusion = SceneFusion(self._model, parameters)
+        self._settings, self._fusion = parameters, self._make_fusion(parameters)
         self._surface = ObservedSurface(self._model, self._make_grid(), parameters.explained_within)
         self._mesh_uri = ""
         try:
             self._mesh_uri = export_mesh(self._model)
         except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
             self.get_logger().warning(f"objects/markers stays empty, the mesh cannot be written for viewers: {error}")
+
+    def _make_fusion(self, parameters: FusionParameters) -> SceneFusion | JointFusion:
+        if self.value("method") == "best-view":
+            return SceneFusion(self._model, parameters)
+        usual, width, height = Tray.for_model(self._model), self.value("bin_width"), self.value("wall_height")
+        tray = Tray(width or usual.width, usual.wall_height if height < 0 else height)
+        return JointFusion(self._model, parameters, tray=tray)
 
     def _make_grid(self) -> SurfaceGrid:
         usual = SurfaceGrid.for_model(self._model)
@@ -173,23 +209,29 @@ class HypothesisFusionNode(GraphNode):
             check_in_front(hypotheses.T_camera_object)
         with self.measure(stamp) as summary:
             verification = self._verifier.score(values["depth"], values["camera"], hypotheses)
-            self._fusion.add_view(stamp, values["pose"], hypotheses, verification)
+            found = stamp, values["pose"], hypotheses, verification
+            if isinstance(self._fusion, JointFusion):
+                self._fusion.add_view(*found, values["depth"], values["camera"])
+            else:
+                self._fusion.add_view(*found)
             self._surface.add_view(stamp, values["depth"], values["camera"], values["pose"])
             self._latest = stamp, values["pose"], values["camera"]
-            count = self._publish(*self._latest)
-            summary.append(f"{len(hypotheses)} hypotheses, {count} objects")
+            objects = self._publish(*self._latest)
+            confirmed = np.count_nonzero(objects.probability >= self._settings.confirmed)
+            summary.append(f"{len(hypotheses)} hypotheses, {len(objects)} objects, {confirmed} of them confirmed")
 
-    def _publish(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> int:
-        """Publish the objects after the latest view; how many there are."""
+    def _publish(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
+        """Publish the objects after the latest view, and return them."""
         objects = self._fusion.objects(stamp, T_world_camera, camera)
         self._objects.publish(objects_to_cloud(objects, stamp, self.world_frame))
         self._poses.publish(poses_to_array(objects.T_world_object, stamp, self.world_frame))
+        confirmed = self._settings.confirmed
         shown = objects if self._mesh_uri else SceneObjects.empty()
-        self._markers.publish(objects_to_markers(shown, self._mesh_uri, stamp, self.world_frame))
+        self._markers.publish(objects_to_markers(shown, self._mesh_uri, stamp, self.world_frame, confirmed))
         unexplained = self._surface.unexplained(objects.T_world_object)
         self._unexplained.publish(points_to_cloud(unexplained, stamp, self.world_frame))
         self._detections.publish(objects, self._model, stamp, self.world_frame)
-        return len(objects)
+        return objects
 
 
 def export_mesh(model: ObjectModel) -> str:

@@ -21,6 +21,8 @@ from active6d_perception.scene.hypothesis_table import HypothesisTable, confiden
 from active6d_perception.scene.observed_surface import EXPLAINED_WITHIN
 from active6d_perception.suppression import suppress_neighbours
 
+#: How views are fused: the best hypothesis of a single view, or all depth images together (:class:`.JointFusion`).
+METHODS = ("best-view", "all-views")
 #: Ways to rank hypotheses, see :class:`FusionParameters`.
 RANKINGS = ("evidence", "confidence", "verification", "score")
 
@@ -41,7 +43,8 @@ class FusionParameters:
             fits its pixels at every rotation. With these three a cluster is ranked by its best hypothesis, so that one
             overconfident wrong view can win. ``evidence`` takes the hypothesis with the highest confidence, and ranks
             clusters by the sum of their squared confidences, so that views which agree win.
-        least_probability: objects less probable than this are withdrawn; only :class:`.JointFusion` knows probabilities.
+        confirmed: objects with at least this probability count; the others are shown, and worth another view.
+        least_probability: objects less probable than this are withdrawn. Only :class:`.JointFusion` withdraws.
         explained_within: an object explains surface at most this fraction of the diameter away, see
             :class:`~active6d_perception.scene.observed_surface.Explainer`.
 
@@ -53,6 +56,7 @@ class FusionParameters:
     exclusion: float = 0.2
     min_verification: float = -1.0
     rank_by: str = "evidence"
+    confirmed: float = 0.5
     least_probability: float = 0.02
     explained_within: float = EXPLAINED_WITHIN
 
@@ -63,8 +67,9 @@ class FusionParameters:
             raise ValueError(f"fusion: exclusion must not be negative, got {self.exclusion}")
         if not -1 <= self.min_verification <= 1:
             raise ValueError(f"fusion: min_verification must be in [-1, 1], got {self.min_verification}")
-        if not 0 <= self.least_probability <= 1:
-            raise ValueError(f"fusion: least_probability must be in [0, 1], got {self.least_probability}")
+        for name in ("confirmed", "least_probability"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"fusion: {name} must be in [0, 1], got {getattr(self, name)}")
         if not 0 < self.explained_within <= 1:
             raise ValueError(f"fusion: explained_within must be in (0, 1], got {self.explained_within}")
         if self.rank_by not in RANKINGS:
