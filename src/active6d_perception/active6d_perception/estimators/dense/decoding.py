@@ -33,7 +33,7 @@ class DecodingParameters:
         coordinates: whether to fit object coordinates to points; otherwise poses come from votes for centre and axis.
     """
 
-    mask_threshold: float = 0.5
+    mask_threshold: float = 0.3
     pixels: int = 160
     fewest_pixels: int = 12
     tolerance: float = 0.05
