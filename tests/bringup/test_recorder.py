@@ -169,6 +169,7 @@ def test_a_killed_recording_is_read_and_goes_on_in_the_next_file(graph, tmp_path
     killed = EpisodeWriter(folder, names, '{"pose_estimator": {"object": "mug"}}')
     for index, (topic, message) in enumerate(sent[:20]):
         killed.write(topic, serialize_message(message), 10**18 + index)
+    killed._stream.close()  # the system closes the files of a killed process, and frees its lock
     with (folder / "bag.mcap").open("ab") as file:
         file.write(b"\x06half a record")  # what a SIGKILL in the middle of a write leaves
     index = read_bag(folder)

@@ -99,7 +99,7 @@ def test_generate_makes_what_is_missing(tmp_path, monkeypatch):
             return future
 
     monkeypatch.setattr(scene_store, "simulate_heap", drop)
-    monkeypatch.setattr(scene_store, "ProcessPoolExecutor", SameProcess)
+    monkeypatch.setattr(scene_store, "worker_pool", SameProcess)
     made = list(generate("mug", tmp_path, splits=("val",), workers=2))
     assert sorted(path.name for path in made) == [f"val_{index:02d}.npz" for index in range(6)]
     assert sorted(drops) == [("mug", 200_000 + index) for index in range(6)]

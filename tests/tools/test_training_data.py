@@ -21,7 +21,7 @@ def rendered(monkeypatch):
 
     monkeypatch.setattr(training_data, "render_training", render)
     monkeypatch.setattr(training_data, "render_validation", render)
-    monkeypatch.setattr(training_data, "ProcessPoolExecutor", lambda workers, mp_context: ThreadPoolExecutor(workers))
+    monkeypatch.setattr(training_data, "worker_pool", ThreadPoolExecutor)
     return calls
 
 
@@ -33,13 +33,14 @@ def test_only_missing_files_are_rendered(rendered, tmp_path):
         f"training-5/{first}.npz",
         f"training-5/{first + 1}.npz",
     ]
-    assert [path.relative_to(tmp_path).as_posix() for path in shards["validation"]] == [
-        f"validation/{index}.npz" for index in range(training_data.SPLITS["val"])
-    ]
-    total = 2 + training_data.SPLITS["val"]
+    for split in training_data.VALIDATION_SPLITS:
+        assert [path.relative_to(tmp_path).as_posix() for path in shards[split]] == [
+            f"{split}/{index}.npz" for index in range(training_data.SPLITS[split])
+        ]
+    total = 2 + sum(training_data.SPLITS[split] for split in training_data.VALIDATION_SPLITS)
     assert progress == [(done, total) for done in range(total + 1)]
     assert ("mug", first, 5, shards["training"][0]) in rendered
-    assert ("mug", 0, shards["validation"][0]) in rendered
+    assert ("mug", "val", 0, shards["val"][0]) in rendered
     shards["training"][1].unlink()
     rendered.clear()
     assert training_data.render_missing("mug", tmp_path, 2, 5, 1) == shards

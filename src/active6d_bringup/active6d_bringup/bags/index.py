@@ -135,7 +135,9 @@ def _read_own(folder: Path) -> tuple[BagIndex | None, tuple[str, ...]]:
             diagnostics.append(message.payload)
             continue
         stamp = stamp_of(message.type, message.payload)
-        repeated |= TOPICS[topic] in CAMERA_TOPICS and stamp in payloads[topic]
+        # A recorder that was restarted gets the last messages once more; they are the same.
+        known = payloads[topic].get(stamp)
+        repeated |= TOPICS[topic] in CAMERA_TOPICS and known is not None and known != message.payload
         payloads[topic][stamp] = message.payload
         received[topic][stamp] = message.received
     recording = dict(payloads), dict(received), diagnostics, _parse_settings(settings)
