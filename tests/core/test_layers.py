@@ -32,6 +32,7 @@ TRAINING = {
 }
 #: Registers the environment where Gymnasium is installed, and must import where it is not.
 REGISTRATION = "active6d_agent.environment.registration"
+MOST_LINES_OF_A_NODE, MOST_LINES_OF_A_FUNCTION = 300, 60
 #: Folders of the conversion and node layers.
 ROS_FOLDERS = {"ros", "nodes"}
 #: Modules that need ROS and lie in no such folder.
@@ -145,6 +146,19 @@ def test_a_robot_needs_neither_simulator_nor_trainer(package):
     for module, path in modules_of(package):
         needed = imports_of(path) & NOT_ON_A_ROBOT
         assert not needed or module in TRAINING | {REGISTRATION}, f"{path} imports {sorted(needed)}"
+
+
+def test_nodes_and_functions_are_short():
+    """Nodes are thin, and a function does one thing."""
+    long = []
+    for module, path in (found for package in MAY_IMPORT for found in modules_of(package)):
+        text = path.read_text()
+        if "nodes" in module.split(".") and len(text.splitlines()) > MOST_LINES_OF_A_NODE:
+            long.append(module)
+        functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
+        lengths = {f"{module}.{f.name}": (f.end_lineno or 0) - f.lineno + 1 for f in functions}
+        long += [name for name, length in lengths.items() if length > MOST_LINES_OF_A_FUNCTION]
+    assert not long
 
 
 def test_lists_of_modules_are_current():

@@ -130,20 +130,13 @@ def measure_estimators(
             on_progress(f"{contender.name}, fused", done, done)
             fused = _fuse_walks(contender, views, walks, noises[0])
             rows[f"{noises[0]:g}"][contender.name]["fused"] = fused
-    document = {
-        "object": object_name,
-        "split": split,
-        "views": len(pairs),
-        "seed": seed,
-        "sensor": sensor,
-        "estimators": {
-            contender.name: {"identity": contender.identity, **headline(rows[f"{noises[0]:g}"][contender.name])}
-            for contender in contenders
-        },
-        "peak_memory_mib": _peak_memory_mib(),
-        "noise": rows,
+    summaries = {
+        contender.name: {"identity": contender.identity, **headline(rows[f"{noises[0]:g}"][contender.name])}
+        for contender in contenders
     }
-    return Measurement(document, results)
+    settings = {"object": object_name, "split": split, "views": len(pairs), "seed": seed, "sensor": sensor}
+    measured = {"estimators": summaries, "peak_memory_mib": _peak_memory_mib(), "noise": rows}
+    return Measurement({**settings, **measured}, results)
 
 
 def _measure_views(

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from active6d_core.object_model import ObjectModel
     from active6d_tools.benchmark.estimator_views import Measurement
 
+_WEIGHTS = "Weights of the dense estimator instead of the shipped ones; repeatable, to compare them."
+_RECORDS = "File for the results of all views; a run continues from it."
+
 
 def estimator(
     object_name: ObjectName = "mug",
@@ -33,16 +36,8 @@ def estimator(
         typer.Option(min=0.0, help="Factor on the noise of the simulated sensor; repeatable. By default 1."),
     ] = None,
     moves: Annotated[int, typer.Option(min=0, help="Also fuse the views of this many moves in each scene.")] = 0,
-    weights: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE",
-            help="Weights of the dense estimator instead of the shipped ones; repeatable, to compare them.",
-        ),
-    ] = None,
-    records: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="File for the results of all views; a run continues from it.")
-    ] = None,
+    weights: Annotated[list[Path] | None, typer.Option(metavar="FILE", help=_WEIGHTS)] = None,
+    records: Annotated[Path | None, typer.Option(metavar="FILE", help=_RECORDS)] = None,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for PNG plots of the scores.")] = None,
     seed: Seed = 0,
     json_file: JsonFile = None,

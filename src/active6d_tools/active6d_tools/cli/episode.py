@@ -39,16 +39,11 @@ def episode(
         typer.Option(metavar="NAME", help="Stored scene, such as mug/test/3, instead of a pile simulated with --seed."),
     ] = None,
     sensor: SensorName = "auto",
-    bag: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Record every topic to a bag in this new folder.")
-    ] = None,
+    bag: Annotated[Path | None, typer.Option(metavar="DIR", help="Record to a bag in this new folder.")] = None,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write an HTML report of the bag; needs --bag.")
     ] = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Draw a figure of the episode as PNG; needs --bag."),
-    ] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw a figure as PNG; needs --bag.")] = None,
     processes: Processes = False,
     params_file: ParamsFile = None,
     override: NodeParameters = None,

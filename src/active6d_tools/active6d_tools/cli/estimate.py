@@ -26,12 +26,8 @@ def estimate(
     folder: Annotated[Path | None, typer.Argument(metavar="[FOLDER]", help="A scene folder in BOP format.")] = None,
     object_name: ObjectName = "mug",
     rgb: Annotated[Path | None, typer.Option(metavar="FILE", help="One colour image instead of a folder.")] = None,
-    depth: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Depth image of --rgb: 16-bit image or .npy array.")
-    ] = None,
-    intrinsics: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Intrinsics of --rgb: JSON file with K or cam_K, 9 numbers.")
-    ] = None,
+    depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Its depth: 16-bit image or .npy array.")] = None,
+    intrinsics: Annotated[Path | None, typer.Option(metavar="FILE", help="Its K or cam_K: JSON file.")] = None,
     depth_scale: Annotated[
         float | None,
         typer.Option(min=0.0, help="Metres per unit of --depth; by default 0.001 for integers, 1 for floats."),
@@ -47,9 +43,7 @@ def estimate(
         bool, typer.Option("--region-in-world", help="The box is in the world frame; the scene needs camera poses.")
     ] = False,
     object_id: Annotated[int, typer.Option(min=1, help="BOP object id for the CSV file.")] = 1,
-    min_score: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Draw only hypotheses with at least this score.")
-    ] = 0.5,
+    min_score: Annotated[float, typer.Option(min=0.0, max=1.0, help="Least score of what is drawn.")] = 0.5,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")] = Path("estimates"),
     imports: Imports = None,
     json_file: JsonFile = None,

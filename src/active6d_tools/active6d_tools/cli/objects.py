@@ -81,18 +81,9 @@ def add(
     axis: Annotated[
         tuple[float, float, float] | None, typer.Option(help="Axis of a continuous symmetry in the mesh frame.")
     ] = None,
-    instances: Annotated[tuple[int, int], typer.Option(help="Minimum and maximum number of instances in a scene.")] = (
-        8,
-        14,
-    ),
-    color: Annotated[tuple[float, float, float], typer.Option(help="Red, green and blue, each from 0 to 1.")] = (
-        0.6,
-        0.6,
-        0.62,
-    ),
-    into: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the description and the mesh.")] = Path(
-        "objects"
-    ),
+    instances: Annotated[tuple[int, int], typer.Option(help="Fewest and most instances in a scene.")] = (8, 14),
+    color: Annotated[tuple[float, float, float], typer.Option(help="RGB, each from 0 to 1.")] = (0.6, 0.6, 0.62),
+    into: Annotated[Path, typer.Option(metavar="DIR", help="Folder of description and mesh.")] = Path("objects"),
 ) -> None:
     """Add an object: copy its mesh and write its description file.
 
@@ -103,7 +94,6 @@ def add(
     import yaml
 
     from active6d_core.mesh_file import close_mesh, load_mesh
-    from active6d_core.object_model import read_description
 
     if not name.replace("_", "").replace("-", "").isalnum():
         raise ValueError(f"--name '{name}': use letters, digits, - and _")
@@ -117,15 +107,7 @@ def add(
     if axis is not None:
         description["symmetry"] = {"axis": list(axis)}
     description |= {"instances": list(instances), "color": list(color), "source": mesh.name}
-    mesh_path.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(mesh, mesh_path)
-    try:
-        write_file(description_path, yaml.safe_dump(description, sort_keys=False))
-        model = read_description(description_path)
-    except Exception as error:  # readers of meshes raise many kinds on damaged files
-        description_path.unlink(missing_ok=True)
-        mesh_path.unlink()
-        raise ValueError(f"{mesh} cannot be added: {error}") from error
+    model = _store(mesh, mesh_path, description_path, yaml.safe_dump(description, sort_keys=False))
     for repair in close_mesh(load_mesh(mesh)):
         console.print(f"repaired each time it is loaded: {repair}", highlight=False, markup=False)
     size = " x ".join(f"{1e3 * extent:.1f}" for extent in model.mesh.extents)
@@ -133,6 +115,21 @@ def add(
     folders = os.environ.get("ACTIVE6D_OBJECT_PATH", "").split(os.pathsep)
     if str(into) not in folders and str(into.resolve()) not in folders:
         console.print(f"export ACTIVE6D_OBJECT_PATH={into.resolve()}", highlight=False, markup=False)
+
+
+def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str) -> "ObjectModel":
+    """Copy the mesh, write the description and read the object; nothing is left where that fails."""
+    from active6d_core.object_model import read_description
+
+    mesh_path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(mesh, mesh_path)
+    try:
+        write_file(description_path, description)
+        return read_description(description_path)
+    except Exception as error:  # readers of meshes raise many kinds on damaged files
+        description_path.unlink(missing_ok=True)
+        mesh_path.unlink()
+        raise ValueError(f"{mesh} cannot be added: {error}") from error
 
 
 def _describe(model: "ObjectModel") -> dict:

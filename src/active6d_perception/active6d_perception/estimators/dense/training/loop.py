@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -145,15 +145,10 @@ def train(
             averaged = TrainedNetwork(run.averaged_on_cpu(), canonical_frame, model.name, model.diameter, options.size)
             run.history.append({"step": run.step, **mean, **validate(model, averaged, validation)})
             if max(run.history, key=worth)["step"] == run.step:
-                # Where the starting weights lay is nobody's business; their name is enough.
+                # Of the starting weights only the name is published, not the path.
                 named = {**asdict(options), "start": Path(options.start).name}
                 training = {"options": named, "heaps": len(shards), "validation": run.history[-1]}
-                save_network(
-                    best,
-                    TrainedNetwork(
-                        averaged.network, canonical_frame, model.name, model.diameter, options.size, training
-                    ),
-                )
+                save_network(best, replace(averaged, training=training))
             write_file(folder / "curves.json", json.dumps(run.history, indent=1) + "\n")
             draw_curves(run.history, folder / "curves.png", title=f"{model.name}: training of the dense estimator")
         if run.step % options.checkpoint_every == 0 or run.step == options.steps:
