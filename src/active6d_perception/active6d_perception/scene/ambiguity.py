@@ -21,7 +21,7 @@ from active6d_perception.scene.solid import Solid, solid_of
 _ROTATIONS = 36
 # A point tells rotations apart if at least this share of them puts no surface there.
 _TELLING = 0.5
-_TELLING_SAMPLES, _BODY_SAMPLES, _ALL_SAMPLES = 64, 96, 192
+_TELLING_SAMPLES, _BODY_SAMPLES, _ALL_SAMPLES = 64, 96, 384
 
 
 @lru_cache(maxsize=16)

@@ -29,18 +29,21 @@ _COLUMNS = len(_UPPER[0]) + _SIZE + 1
 class BodyRefinement:
     """Point-to-plane ICP of poses against the measured points of all views at once.
 
-    A sample that a camera sees is paired with the nearest measured point around its pixel, if that is within the gate
-    and has a similar normal. What other objects hide is farther than the gate behind them and has no pair. The planes
+    A sample that a camera sees is paired with a measured point that is within the gate and has a similar normal. What other objects hide is farther than the gate behind them and has no pair. The planes
     are the model's, which have no noise.
 
     Args:
         samples: of the part of the surface to align.
         gates: largest distance of a pair in each step, metres.
         lattice: step of the lattice, metres; a finer one gives finer poses, a coarser one remembers more.
+        search: whether the nearest point is searched for around a sample's pixel. That point is found even where the
+            pose is off; without a search the sample's own pixel is taken, in a third of the time.
     """
 
-    def __init__(self, samples: VisibleSamples, gates: tuple[float, ...], lattice: float) -> None:
-        self._samples, self._gates, self._lattice = samples, gates, lattice
+    def __init__(
+        self, samples: VisibleSamples, gates: tuple[float, ...], lattice: float, *, search: bool = True
+    ) -> None:
+        self._samples, self._gates, self._lattice, self._search = samples, gates, lattice, search
 
     def refine(self, T_world_object: np.ndarray, views: Sequence[tuple[MeasuredView, Memo]]) -> np.ndarray:
         """Refine (k, 4, 4) poses, metres, over views with what is remembered of each.
@@ -61,7 +64,7 @@ class BodyRefinement:
         self, rounded: np.ndarray, keys: list[bytes], view: MeasuredView, memo: Memo, gate: float
     ) -> np.ndarray:
         def compute(missing: np.ndarray) -> np.ndarray:
-            return normal_equations(rounded[missing], self._samples, view, gate)
+            return normal_equations(rounded[missing], self._samples, view, gate, self._search)
 
         return memo.rows([(gate, id(self._samples), key) for key in keys], compute)
 
@@ -84,7 +87,7 @@ def _step(T: np.ndarray, rounded: np.ndarray, equations: np.ndarray) -> np.ndarr
 
 @compiled
 def normal_equations(
-    T_world_object: np.ndarray, samples: VisibleSamples, view: MeasuredView, gate: float
+    T_world_object: np.ndarray, samples: VisibleSamples, view: MeasuredView, gate: float, search: bool
 ) -> np.ndarray:
     """The normal equations of one view's pairs, for a rotation about each pose's origin and a shift, in world axes.
 
@@ -93,6 +96,7 @@ def normal_equations(
         samples: of the surface to align.
         view: what was measured.
         gate: largest distance of a pair, metres.
+        search: see :class:`BodyRefinement`.
 
     Returns:
         (k, 28): the upper half of the matrix by rows, the right side, and the number of pairs.
@@ -112,7 +116,7 @@ def normal_equations(
             x, y, z = ax + P[0, 3], ay + P[1, 3], az + P[2, 3]
             if z < 1e-3:
                 continue
-            v, u = _nearest_pixel(x, y, z, view, gate)
+            v, u = _nearest_pixel(x, y, z, view, gate, search)
             if v < 0:
                 continue
             d, e, f = samples.normals[s, 0], samples.normals[s, 1], samples.normals[s, 2]
@@ -143,16 +147,33 @@ def _add(J: np.ndarray, residual: float, row: np.ndarray) -> None:
 
 
 @compiled
-def _nearest_pixel(x: float, y: float, z: float, view: MeasuredView, gate: float) -> tuple[int, int]:
+def _nearest_pixel(x: float, y: float, z: float, view: MeasuredView, gate: float, search: bool) -> tuple[int, int]:
     """Row and column of the measured point nearest to a point in the optical frame; -1 without one within ``gate``."""
-    height, width = view.instance.shape
     u, v = x / z * view.fx + view.cx, y / z * view.fy + view.cy
-    reach = gate * view.fx / z
-    row, column, least = -1, -1, gate * gate
+    if not search:
+        row, column, _ = _nearest_within(x, y, z, np.rint(u), np.rint(v), 0.0, view, gate * gate)
+        return row, column
+    row, column, least = _nearest_within(x, y, z, u, v, 1.0, view, gate * gate)
+    # The nearest point of the first pixels bounds how far away a nearer one can be.
+    reach = np.sqrt(least) * view.fx / z
+    if reach > 1.0:
+        further = _nearest_within(x, y, z, u, v, reach, view, least)
+        if further[0] >= 0:
+            row, column = further[0], further[1]
+    return row, column
+
+
+@compiled
+def _nearest_within(
+    x: float, y: float, z: float, u: float, v: float, reach: float, view: MeasuredView, least: float
+) -> tuple[int, int, float]:
+    """As :func:`_nearest_pixel`, within ``reach`` pixels of (u, v) and a squared distance of ``least``, and that one."""
+    height, width = view.instance.shape
+    row, column = -1, -1
     for i in range(max(int(np.ceil(v - reach)), 0), min(int(np.floor(v + reach)) + 1, height)):
         for j in range(max(int(np.ceil(u - reach)), 0), min(int(np.floor(u + reach)) + 1, width)):
             dx, dy, dz = view.points[i, j, 0] - x, view.points[i, j, 1] - y, view.points[i, j, 2] - z
             square = dx * dx + dy * dy + dz * dz
             if square < least:
                 row, column, least = i, j, square
-    return row, column
+    return row, column, least

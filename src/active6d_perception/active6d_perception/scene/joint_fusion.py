@@ -43,7 +43,7 @@ _OWN = 0.25
 _BESIDE = 1.3
 # Refinement, metres: gates of the steps, and the lattice. Bodies are many and only compared; what is reported is finer.
 _BODY_GATES, _BODY_LATTICE = (0.008, 0.004, 0.004), 0.002
-_WHOLE_GATES, _WHOLE_LATTICE = (0.004, 0.004, 0.004), 0.001
+_WHOLE_GATES, _WHOLE_LATTICE = (0.008, 0.004), 0.0005
 # A body whose log-odds are so much below the best at its place is not looked at further.
 _HOPELESS = 12.0
 # Evidence is taken at poses on this lattice, metres.
@@ -101,7 +101,7 @@ class JointFusion:
         self._tray = tray or Tray.for_model(model)
         self._known = HypothesisTable(self.ambiguity.body_distance.between)
         self._bodies = BodyRefinement(self.ambiguity.body_samples, _BODY_GATES, _BODY_LATTICE)
-        self._whole = BodyRefinement(self.ambiguity.all_samples, _WHOLE_GATES, _WHOLE_LATTICE)
+        self._whole = BodyRefinement(self.ambiguity.all_samples, _WHOLE_GATES, _WHOLE_LATTICE, search=False)
         self.reset()
 
     @property
