@@ -136,8 +136,8 @@ def test_rounding_moves_a_pose_little_and_near_poses_alike(seed):
     assert round_poses(near, 0.001)[1] == keys
 
 
-def brute_force_equations(T, model, samples, view, gate):
-    """Equations of one pose by a loop over samples and all pixels."""
+def brute_force_equations(T, samples, view, gate, search):
+    """Equations of one pose by a loop over samples and all pixels, or over the samples' own pixels."""
     T_camera_object = view.T_camera_world @ T
     direction = direction_of(T_camera_object, samples.nearest)
     A, g, count = np.zeros((6, 6)), np.zeros(6), 0
@@ -147,8 +147,9 @@ def brute_force_equations(T, model, samples, view, gate):
         p = T_camera_object[:3, :3] @ samples.points[s] + T_camera_object[:3, 3]
         n = T_camera_object[:3, :3] @ samples.normals[s]
         distance = np.linalg.norm(cloud - p, axis=1)
-        nearest = np.nanargmin(distance)
-        if distance[nearest] >= gate or not view.normals.reshape(-1, 3)[nearest] @ n > 0.5:
+        u, v = (np.rint(f * p[i] / p[2] + c) for i, f, c in ((0, view.fx, view.cx), (1, view.fy, view.cy)))
+        nearest = np.nanargmin(distance) if search else int(v) * view.points.shape[1] + int(u)
+        if not distance[nearest] < gate or not view.normals.reshape(-1, 3)[nearest] @ n > 0.5:
             continue
         n_world = R_world_camera @ n
         arm = R_world_camera @ (p - T_camera_object[:3, 3])
@@ -159,11 +160,12 @@ def brute_force_equations(T, model, samples, view, gate):
     return np.concatenate([A[np.triu_indices(6)], g, [count]])
 
 
-def test_equations_are_those_of_brute_force(mug, views_of_mug):
+@pytest.mark.parametrize("search", [True, False])
+def test_equations_are_those_of_brute_force(mug, views_of_mug, search):
     samples = visible_samples(model_views(mug), ~ambiguity_of(mug).telling, 24, mug.mesh.area)
     T = POSE @ make_transform(Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix(), [0.001, 0.002, -0.001])
-    found = normal_equations(T[None], samples, views_of_mug[0], 0.008)[0]
-    expected = brute_force_equations(T, mug, samples, views_of_mug[0], 0.008)
+    found = normal_equations(T[None], samples, views_of_mug[0], 0.008, search)[0]
+    expected = brute_force_equations(T, samples, views_of_mug[0], 0.008, search)
     assert found[-1] == expected[-1] > 8
     np.testing.assert_allclose(found, expected, atol=1e-5)
 

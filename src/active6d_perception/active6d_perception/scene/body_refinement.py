@@ -29,8 +29,9 @@ _COLUMNS = len(_UPPER[0]) + _SIZE + 1
 class BodyRefinement:
     """Point-to-plane ICP of poses against the measured points of all views at once.
 
-    A sample that a camera sees is paired with a measured point that is within the gate and has a similar normal. What other objects hide is farther than the gate behind them and has no pair. The planes
-    are the model's, which have no noise.
+    A sample that a camera sees is paired with a measured point that is within the gate and has a similar normal. What
+    other objects hide is farther than the gate behind them and has no pair. The planes are the model's, which have no
+    noise.
 
     Args:
         samples: of the part of the surface to align.
@@ -102,8 +103,7 @@ def normal_equations(
         (k, 28): the upper half of the matrix by rows, the right side, and the number of pairs.
     """
     result = np.zeros((len(T_world_object), _COLUMNS))
-    W = view.T_camera_world
-    J = np.empty(6)
+    W, J = view.T_camera_world, np.empty(_SIZE)
     for k in range(len(T_world_object)):
         P, row = W @ T_world_object[k], result[k]
         direction = direction_of(P, samples.nearest)
@@ -167,7 +167,7 @@ def _nearest_pixel(x: float, y: float, z: float, view: MeasuredView, gate: float
 def _nearest_within(
     x: float, y: float, z: float, u: float, v: float, reach: float, view: MeasuredView, least: float
 ) -> tuple[int, int, float]:
-    """As :func:`_nearest_pixel`, within ``reach`` pixels of (u, v) and a squared distance of ``least``, and that one."""
+    """As :func:`_nearest_pixel`, within ``reach`` pixels of (u, v) and the squared distance ``least``; and that one."""
     height, width = view.instance.shape
     row, column = -1, -1
     for i in range(max(int(np.ceil(v - reach)), 0), min(int(np.floor(v + reach)) + 1, height)):
