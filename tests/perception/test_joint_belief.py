@@ -24,11 +24,11 @@ from active6d_perception.scene.belief_training import LabelledPlaces, fit_belief
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer, belief_path, load_belief
 from active6d_perception.scene.expected_visibility import OPEN_TABLE, Tray
 from active6d_perception.scene.feasibility import FREE, against_container, against_neighbour
-from active6d_perception.scene.measured_view import MeasuredView, measure_view
+from active6d_perception.scene.measured_view import NORMAL, MeasuredView, measure_view
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_perception.scene.rotation_belief import decide, posterior
 from active6d_perception.scene.scene_evidence import BODY_COLUMNS, ROTATION_COLUMNS
-from active6d_perception.scene.solid import signed_distance, solid_of
+from active6d_perception.scene.solid import signed_distances, solid_of
 
 CAMERA = PinholeCamera(320, 240, 277.0, 277.0, 159.5, 119.5)
 IDENTITY = np.eye(4)[None]
@@ -36,10 +36,10 @@ IDENTITY = np.eye(4)[None]
 
 def flat_view(behind: float, normal=(0.0, 0.0, -1.0), own=True) -> MeasuredView:
     """A wall 0.5 m away plus ``behind``, of one instance whose middle is there."""
-    points = np.full((240, 320, 3), 0.5 + behind, np.float32)
-    normals = np.broadcast_to(np.array(normal, np.float32), points.shape).copy()
+    depth = np.full((240, 320), 0.5 + behind, np.float32)
+    normals = np.broadcast_to(np.array(normal) * NORMAL, (240, 320, 3)).astype(np.int8)
     middles = np.array([[0.0, 0.0, 0.5 if own else 3.0]])
-    return MeasuredView(points, normals, np.zeros((240, 320), np.int16), middles, np.eye(4), 277.0, 277.0, 159.5, 119.5)
+    return MeasuredView(depth, normals, np.zeros((240, 320), np.int16), middles, np.eye(4), 277.0, 277.0, 159.5, 119.5)
 
 
 #: One square centimetre that faces the camera at 0.5 m.
@@ -67,7 +67,7 @@ def count(view, T=AHEAD, rotations=IDENTITY):
         (flat_view(0.0), cases.FITTING, 0),
         (flat_view(0.0, own=False), cases.FITTING, 1),
         (flat_view(0.0, normal=(1.0, 0.0, 0.0)), cases.FACING_ELSEWHERE, 0),
-        (flat_view(0.0, normal=(np.nan,) * 3), cases.FACING_ELSEWHERE, 0),
+        (flat_view(0.0, normal=(0.0, 0.0, 0.0)), cases.FACING_ELSEWHERE, 0),
         (flat_view(-0.008), cases.LITTLE_BEFORE, 0),
         (flat_view(-0.02), cases.HIDDEN, 0),
         (flat_view(np.nan), cases.NOT_MEASURED, 0),
@@ -122,13 +122,13 @@ def ball():
 @given(st.tuples(*[st.floats(-0.042, 0.042)] * 3))
 @settings(max_examples=60, deadline=None)
 def test_signed_distance_of_a_ball(ball, point):
-    found, radius = signed_distance(*point, ball[1]), np.linalg.norm(point)
+    found, radius = signed_distances(np.array([point]), ball[1])[0], np.linalg.norm(point)
     # Between the corners of a cell, distance from the middle is not linear.
     assert found == pytest.approx(radius - 0.04, abs=4e-4 if radius > 0.02 else 2e-3)
 
 
 def test_outside_of_its_grid_a_solid_is_infinitely_far(ball):
-    assert signed_distance(0.2, 0.0, 0.0, ball[1]) == np.inf
+    assert signed_distances(np.array([[0.2, 0.0, 0.0]]), ball[1])[0] == np.inf
 
 
 def test_what_is_solid_at_every_rotation_of_a_box_is_the_cylinder_in_it():
@@ -137,9 +137,9 @@ def test_what_is_solid_at_every_rotation_of_a_box_is_the_cylinder_in_it():
     solid = solid_of(model, make_transform(about_z, np.zeros(3)))
     for angle in (0.0, 0.7):
         inside, outside = 0.037, 0.0445
-        c, s = np.cos(angle), np.sin(angle)
-        assert signed_distance(inside * c, inside * s, 0.0, solid) < 0
-        assert signed_distance(outside * c, outside * s, 0.0, solid) > 0
+        along = np.array([np.cos(angle), np.sin(angle), 0.0])
+        within, beyond = signed_distances(np.array([inside, outside])[:, None] * along, solid)
+        assert within < 0 < beyond
 
 
 def test_container_columns_of_a_stick():
@@ -172,6 +172,8 @@ def test_neighbour_columns_are_those_of_a_ball(ball):
         if distance.min() < 0.004:
             assert found[0, r, 1] == pytest.approx(distance.min(), abs=2e-3)
     np.testing.assert_array_equal(found[1], [[0.0, FREE]] * 2)
+    nothing = against_neighbour(T, N, rotations, np.zeros((0, 3)), solid)
+    np.testing.assert_array_equal(nothing, np.broadcast_to([0.0, FREE], (2, 2, 2)))
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -1,5 +1,7 @@
 """Fusion from all views on rendered mugs: what one view guesses wrong, the others correct."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -172,3 +174,9 @@ def test_the_current_view_gives_boxes_where_it_has_hypotheses(mug, episode):
     beside = fusion.objects(77, T_world_camera, CAMERA)
     assert np.abs(beside.box - objects.box).max() > 1e-4
     np.testing.assert_allclose(beside.box, objects.box, atol=0.02)
+
+
+def test_improbable_objects_are_withdrawn(mug, episode):
+    weights = hand_set_weights()
+    doubtful = replace(weights, probability=Scorer.of_weights(np.eye(len(OBJECT_COLUMNS))[0] * -10.0))
+    assert len(objects_of(fuse(mug, episode, doubtful), episode[-1])) == 0

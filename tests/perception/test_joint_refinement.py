@@ -16,7 +16,7 @@ from active6d_perception.model.visible_samples import direction_of, nearest_dire
 from active6d_perception.scene.ambiguity import ambiguity_of
 from active6d_perception.scene.body_candidates import BodyCandidates, gather_candidates, merge_duplicates, number_places
 from active6d_perception.scene.body_refinement import BodyRefinement, normal_equations
-from active6d_perception.scene.measured_view import measure_view
+from active6d_perception.scene.measured_view import NORMAL, measure_view
 from active6d_perception.scene.memo import Memo
 from active6d_perception.scene.pose_lattice import round_poses
 
@@ -79,11 +79,11 @@ def test_a_measured_view_is_the_organised_cloud_of_its_depth(mug, render, pose):
     ambiguity = ambiguity_of(mug)
     view = measure_view(depth, CAMERA, T_world_camera, hypotheses, ambiguity)
     points = backproject(depth, CAMERA)
-    np.testing.assert_allclose(view.points, points, atol=1e-6)
+    np.testing.assert_array_equal(view.depth, depth)
     expected = normals_from_points(points, reach=1)
-    np.testing.assert_array_equal(np.isnan(view.normals), np.isnan(expected))
-    alike = np.einsum("hwi,hwi->hw", view.normals, expected)
-    assert np.nanmin(alike) > 0.999
+    np.testing.assert_array_equal((view.normals == 0).all(axis=-1), np.isnan(expected).any(axis=-1))
+    alike = np.einsum("hwi,hwi->hw", view.normals / NORMAL, expected)
+    assert np.nanmin(alike) > 0.99
     np.testing.assert_array_equal(view.instance, np.where(segmentation == 7, 0, -1))
     np.testing.assert_allclose(view.middles, transform_points(T_world_camera @ pose(3), ambiguity.middle[None])[:, 0])
 
@@ -128,12 +128,15 @@ def test_a_memo_computes_each_row_once_until_it_is_not_asked_for():
 def test_rounding_moves_a_pose_little_and_near_poses_alike(seed):
     rng = np.random.default_rng(seed)
     T = make_transform(Rotation.random(5, rng=rng).as_matrix(), rng.uniform(-0.3, 0.3, (5, 3)))
-    rounded, keys = round_poses(T, 0.001)
-    assert np.abs(rounded[:, :3, 3] - T[:, :3, 3]).max() <= 0.5e-3 + 1e-12
+    origin = make_transform(Rotation.random(5, rng=rng).as_matrix(), rng.uniform(-0.3, 0.3, (5, 3)))
+    rounded, keys = round_poses(T, origin, 0.001)
+    assert np.abs((invert(origin) @ rounded - invert(origin) @ T)[:, :3, 3]).max() <= 0.5e-3 + 1e-12
     assert np.degrees(rotation_angle(rounded[:, :3, :3], T[:, :3, :3])).max() < 0.5
-    near = T.copy()
-    near[:, :3, 3] = rounded[:, :3, 3] + rng.uniform(-4e-4, 4e-4, (5, 3))
-    assert round_poses(near, 0.001)[1] == keys
+    np.testing.assert_allclose(round_poses(origin, origin, 0.001)[0], origin, atol=1e-12)
+    near = invert(origin) @ T
+    near[:, :3, 3] = (invert(origin) @ rounded)[:, :3, 3] + rng.uniform(-4e-4, 4e-4, (5, 3))
+    assert round_poses(origin @ near, origin, 0.001)[1] == keys
+    assert set(round_poses(T, T, 0.001)[1]).isdisjoint(keys)
 
 
 def brute_force_equations(T, samples, view, gate, search):
@@ -142,14 +145,15 @@ def brute_force_equations(T, samples, view, gate, search):
     direction = direction_of(T_camera_object, samples.nearest)
     A, g, count = np.zeros((6, 6)), np.zeros(6), 0
     R_world_camera = view.T_camera_world[:3, :3].T
-    cloud = view.points.reshape(-1, 3)
+    camera = PinholeCamera(view.depth.shape[1], view.depth.shape[0], view.fx, view.fy, view.cx, view.cy)
+    cloud = backproject(view.depth, camera).reshape(-1, 3)
     for s in samples.chosen[direction, : samples.number[direction]]:
         p = T_camera_object[:3, :3] @ samples.points[s] + T_camera_object[:3, 3]
         n = T_camera_object[:3, :3] @ samples.normals[s]
         distance = np.linalg.norm(cloud - p, axis=1)
         u, v = (np.rint(f * p[i] / p[2] + c) for i, f, c in ((0, view.fx, view.cx), (1, view.fy, view.cy)))
-        nearest = np.nanargmin(distance) if search else int(v) * view.points.shape[1] + int(u)
-        if not distance[nearest] < gate or not view.normals.reshape(-1, 3)[nearest] @ n > 0.5:
+        nearest = np.nanargmin(distance) if search else int(v) * view.depth.shape[1] + int(u)
+        if not distance[nearest] < gate or not view.normals.reshape(-1, 3)[nearest] @ n > 0.5 * NORMAL:
             continue
         n_world = R_world_camera @ n
         arm = R_world_camera @ (p - T_camera_object[:3, 3])

@@ -20,19 +20,22 @@ class BodyCandidates:
 
     Attributes:
         T_world_object: (K, 4, 4) metres; the rotation about an axis of near symmetry is arbitrary.
+        T_world_start: (K, 4, 4) where refinement started, metres.
         place: (K,) number of the place, from 0, by falling evidence of the first candidate there.
         evidence: (K,) sum of the squared confidences of the hypotheses for this body.
         twin: (K,) bool, no hypothesis was there, only for a near-symmetric twin.
     """
 
     T_world_object: np.ndarray
+    T_world_start: np.ndarray
     place: np.ndarray
     evidence: np.ndarray
     twin: np.ndarray
 
     def take(self, index: np.ndarray) -> "BodyCandidates":
         """The candidates at ``index``, in that order."""
-        return BodyCandidates(self.T_world_object[index], self.place[index], self.evidence[index], self.twin[index])
+        poses = self.T_world_object[index], self.T_world_start[index]
+        return BodyCandidates(*poses, self.place[index], self.evidence[index], self.twin[index])
 
     def heads(self) -> np.ndarray:
         """(places,) index of the candidate with the most evidence at each place."""
@@ -60,8 +63,10 @@ def gather_candidates(
     kept = rank < _MOST_BODIES
     T, gathered, place, rank = T[kept], gathered[kept], place[kept], rank[kept]
     count = len(ambiguity.twins)
+    T_twin = (T[None] @ ambiguity.twins[:, None]).reshape(-1, 4, 4)
     return BodyCandidates(
-        (T[None] @ ambiguity.twins[:, None]).reshape(-1, 4, 4),
+        T_twin,
+        T_twin,
         np.tile(place, count),
         np.where(np.repeat(np.arange(count) > 0, len(T)), 0.0, np.tile(gathered, count)),
         np.repeat(np.arange(count) > 0, len(T)),

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from active6d_core.se3 import make_transform
 from active6d_perception.compiled import compiled
 from active6d_perception.model.visible_samples import VisibleSamples, direction_of
-from active6d_perception.scene.measured_view import MeasuredView
+from active6d_perception.scene.measured_view import NORMAL, MeasuredView
 from active6d_perception.scene.memo import Memo
 from active6d_perception.scene.pose_lattice import round_poses
 
@@ -54,7 +54,7 @@ class BodyRefinement:
         """
         T = np.array(T_world_object, float)
         for gate in self._gates:
-            rounded, keys = round_poses(T, self._lattice)
+            rounded, keys = round_poses(T, T_world_object, self._lattice)
             total = np.zeros((len(T), _COLUMNS))
             for view, memo in views:
                 total += self._equations(rounded, keys, view, memo, gate)
@@ -103,77 +103,84 @@ def normal_equations(
         (k, 28): the upper half of the matrix by rows, the right side, and the number of pairs.
     """
     result = np.zeros((len(T_world_object), _COLUMNS))
-    W, J = view.T_camera_world, np.empty(_SIZE)
+    # Loops are in functions of their own that are called once per pose: a call that hands over arrays takes as long
+    # as a pair.
+    rows, measured = np.empty((samples.chosen.shape[1], 6)), np.empty((samples.chosen.shape[1], 3))
     for k in range(len(T_world_object)):
-        P, row = W @ T_world_object[k], result[k]
-        direction = direction_of(P, samples.nearest)
-        for place in range(samples.number[direction]):
-            s = samples.chosen[direction, place]
-            a, b, c = samples.points[s, 0], samples.points[s, 1], samples.points[s, 2]
-            ax = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c
-            ay = P[1, 0] * a + P[1, 1] * b + P[1, 2] * c
-            az = P[2, 0] * a + P[2, 1] * b + P[2, 2] * c
-            x, y, z = ax + P[0, 3], ay + P[1, 3], az + P[2, 3]
-            if z < 1e-3:
-                continue
-            v, u = _nearest_pixel(x, y, z, view, gate, search)
-            if v < 0:
-                continue
-            d, e, f = samples.normals[s, 0], samples.normals[s, 1], samples.normals[s, 2]
-            nx = P[0, 0] * d + P[0, 1] * e + P[0, 2] * f
-            ny = P[1, 0] * d + P[1, 1] * e + P[1, 2] * f
-            nz = P[2, 0] * d + P[2, 1] * e + P[2, 2] * f
-            if not (view.normals[v, u, 0] * nx + view.normals[v, u, 1] * ny + view.normals[v, u, 2] * nz > _ALIKE):
-                continue
-            qx, qy, qz = view.points[v, u, 0] - x, view.points[v, u, 1] - y, view.points[v, u, 2] - z
-            tx, ty, tz = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
-            for i in range(3):
-                J[i] = W[0, i] * tx + W[1, i] * ty + W[2, i] * tz
-                J[3 + i] = W[0, i] * nx + W[1, i] * ny + W[2, i] * nz
-            _add(J, qx * nx + qy * ny + qz * nz, row)
+        P = view.T_camera_world @ T_world_object[k]
+        count = _place(P, direction_of(P, samples.nearest), samples, rows)
+        _pair(rows, P[:3, 3], count, view, gate, search, measured)
+        _add_pairs(rows, P[:3, 3], count, view.T_camera_world, measured, result[k])
     return result
 
 
 @compiled
-def _add(J: np.ndarray, residual: float, row: np.ndarray) -> None:
-    """Add a pair with (6,) Jacobian to (28,) equations."""
-    column = 0
-    for i in range(6):
-        row[21 + i] += J[i] * residual
-        for j in range(i, 6):
-            row[column] += J[i] * J[j]
-            column += 1
-    row[27] += 1
+def _place(P: np.ndarray, direction: int, samples: VisibleSamples, rows: np.ndarray) -> int:
+    """Set the first (n, 6) ``rows`` to the samples' offsets from a (4, 4) pose and normals, optical frame; n."""
+    count = samples.number[direction]
+    for place in range(count):
+        s = samples.chosen[direction, place]
+        a, b, c = samples.points[s, 0], samples.points[s, 1], samples.points[s, 2]
+        d, e, f = samples.normals[s, 0], samples.normals[s, 1], samples.normals[s, 2]
+        for axis in range(3):
+            rows[place, axis] = P[axis, 0] * a + P[axis, 1] * b + P[axis, 2] * c
+            rows[place, 3 + axis] = P[axis, 0] * d + P[axis, 1] * e + P[axis, 2] * f
+    return count
 
 
 @compiled
-def _nearest_pixel(x: float, y: float, z: float, view: MeasuredView, gate: float, search: bool) -> tuple[int, int]:
-    """Row and column of the measured point nearest to a point in the optical frame; -1 without one within ``gate``."""
-    u, v = x / z * view.fx + view.cx, y / z * view.fy + view.cy
-    if not search:
-        row, column, _ = _nearest_within(x, y, z, np.rint(u), np.rint(v), 0.0, view, gate * gate)
-        return row, column
-    row, column, least = _nearest_within(x, y, z, u, v, 1.0, view, gate * gate)
-    # The nearest point of the first pixels bounds how far away a nearer one can be.
-    reach = np.sqrt(least) * view.fx / z
-    if reach > 1.0:
-        further = _nearest_within(x, y, z, u, v, reach, view, least)
-        if further[0] >= 0:
-            row, column = further[0], further[1]
-    return row, column
+def _pair(
+    rows: np.ndarray, t: np.ndarray, count: int, view: MeasuredView, gate: float, search: bool, measured: np.ndarray
+) -> None:
+    """Set (n, 3) ``measured`` to the points that n ``rows`` at (3,) ``t`` are paired with, NaN without one."""
+    height, width = view.depth.shape
+    for place in range(count):
+        measured[place, 0] = np.nan
+        x, y, z = rows[place, 0] + t[0], rows[place, 1] + t[1], rows[place, 2] + t[2]
+        if z < 1e-3:
+            continue
+        u, v = int(np.rint(x / z * view.fx + view.cx)), int(np.rint(y / z * view.fy + view.cy))
+        row, column, least, reach = -1, -1, gate * gate, 1 if search else 0
+        # The nearest point of the first pixels bounds how far away a nearer one can be.
+        for _ in range(2):
+            for i in range(max(v - reach, 0), min(v + reach + 1, height)):
+                for j in range(max(u - reach, 0), min(u + reach + 1, width)):
+                    depth = view.depth[i, j]
+                    dx, dy = (j - view.cx) / view.fx * depth - x, (i - view.cy) / view.fy * depth - y
+                    square = dx * dx + dy * dy + (depth - z) ** 2
+                    if square < least:
+                        row, column, least = i, j, square
+            reach = int(np.sqrt(least) * view.fx / z + 0.5)
+            if not search or reach <= 1:
+                break
+        if row >= 0:
+            normal, nx, ny, nz = view.normals[row, column], rows[place, 3], rows[place, 4], rows[place, 5]
+            if normal[0] * nx + normal[1] * ny + normal[2] * nz > _ALIKE * NORMAL:
+                depth = view.depth[row, column]
+                measured[place, 0] = (column - view.cx) / view.fx * depth
+                measured[place, 1], measured[place, 2] = (row - view.cy) / view.fy * depth, depth
 
 
 @compiled
-def _nearest_within(
-    x: float, y: float, z: float, u: float, v: float, reach: float, view: MeasuredView, least: float
-) -> tuple[int, int, float]:
-    """As :func:`_nearest_pixel`, within ``reach`` pixels of (u, v) and the squared distance ``least``; and that one."""
-    height, width = view.instance.shape
-    row, column = -1, -1
-    for i in range(max(int(np.ceil(v - reach)), 0), min(int(np.floor(v + reach)) + 1, height)):
-        for j in range(max(int(np.ceil(u - reach)), 0), min(int(np.floor(u + reach)) + 1, width)):
-            dx, dy, dz = view.points[i, j, 0] - x, view.points[i, j, 1] - y, view.points[i, j, 2] - z
-            square = dx * dx + dy * dy + dz * dz
-            if square < least:
-                row, column, least = i, j, square
-    return row, column, least
+def _add_pairs(
+    rows: np.ndarray, t: np.ndarray, count: int, W: np.ndarray, measured: np.ndarray, equations: np.ndarray
+) -> None:
+    """Add n pairs to (28,) ``equations`` in world axes; (4, 4) ``W`` maps the world to the optical frame."""
+    J = np.empty(_SIZE)
+    for place in range(count):
+        qx = measured[place, 0]
+        if np.isnan(qx):
+            continue
+        ax, ay, az, nx, ny, nz = rows[place]
+        residual = (qx - ax - t[0]) * nx + (measured[place, 1] - ay - t[1]) * ny + (measured[place, 2] - az - t[2]) * nz
+        tx, ty, tz = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
+        for i in range(3):
+            J[i] = W[0, i] * tx + W[1, i] * ty + W[2, i] * tz
+            J[3 + i] = W[0, i] * nx + W[1, i] * ny + W[2, i] * nz
+        column = 0
+        for i in range(_SIZE):
+            equations[21 + i] += J[i] * residual
+            for j in range(i, _SIZE):
+                equations[column] += J[i] * J[j]
+                column += 1
+        equations[27] += 1

@@ -4,7 +4,7 @@ import numpy as np
 
 from active6d_perception.compiled import compiled
 from active6d_perception.scene.expected_visibility import Tray
-from active6d_perception.scene.solid import Solid, signed_distance
+from active6d_perception.scene.solid import Solid, signed_distances
 
 # Poses are some millimetres off, so that points this deep inside still count as touching; metres.
 _INTO_CONTAINER, _INTO_NEIGHBOUR = 0.003, 0.0015
@@ -75,32 +75,38 @@ def against_neighbour(
     result[:, :, 1] = FREE
     reach = solid.reach + _NEAR
     middle, radius = _ball_around(points)
+    local = np.empty(points.shape)
     for k in range(len(T_world_object)):
-        N = T_world_neighbour[k]
+        T_neighbour_object = _relative(T_world_neighbour[k], T_world_object[k])
         for r in range(len(rotations)):
-            T, row = T_world_object[k] @ rotations[r], result[k, r]
+            T = T_neighbour_object @ rotations[r]
             apart = 0.0
             for axis in range(3):
                 there = T[axis, 0] * middle[0] + T[axis, 1] * middle[1] + T[axis, 2] * middle[2] + T[axis, 3]
-                apart += (there - N[axis, 3]) ** 2
+                apart += there * there
             if apart > (reach + radius) ** 2:
                 continue
             for p in range(len(points)):
                 a, b, c = points[p, 0], points[p, 1], points[p, 2]
-                x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3] - N[0, 3]
-                y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3] - N[1, 3]
-                z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - N[2, 3]
-                if x * x + y * y + z * z > reach * reach:
-                    continue
-                distance = signed_distance(
-                    x * N[0, 0] + y * N[1, 0] + z * N[2, 0],
-                    x * N[0, 1] + y * N[1, 1] + z * N[2, 1],
-                    x * N[0, 2] + y * N[1, 2] + z * N[2, 2],
-                    solid,
-                )
-                row[0] += distance < -_INTO_NEIGHBOUR
-                row[1] = min(row[1], distance)
-            row[0] /= max(len(points), 1)
+                for axis in range(3):
+                    local[p, axis] = T[axis, 0] * a + T[axis, 1] * b + T[axis, 2] * c + T[axis, 3]
+            distances = signed_distances(local, solid)
+            for p in range(len(points)):
+                result[k, r, 0] += distances[p] < -_INTO_NEIGHBOUR
+                result[k, r, 1] = min(result[k, r, 1], distances[p])
+            result[k, r, 0] /= max(len(points), 1)
+    return result
+
+
+@compiled
+def _relative(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """(4, 4) pose B in the frame of A, both (4, 4) poses in one frame."""
+    result = np.eye(4)
+    for i in range(3):
+        for j in range(4):
+            result[i, j] = 0.0
+            for axis in range(3):
+                result[i, j] += A[axis, i] * (B[axis, j] - (A[axis, 3] if j == 3 else 0.0))
     return result
 
 

@@ -8,7 +8,7 @@ Everything follows from the set of views: their order changes nothing. What a vi
 remembered (:mod:`.memo`), so another view costs its own part.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import expit
@@ -144,7 +144,7 @@ class JointFusion:
         """What all views say of every candidate that its body does not rule out."""
         ambiguity, whole = self.ambiguity, _Part("body", np.eye(4)[None], self.ambiguity.body_points)
         candidates = self._candidates(self._order())
-        heads = round_poses(candidates.take(candidates.heads()).T_world_object, _LATTICE)
+        heads = _rounded(candidates.take(candidates.heads()))
         bodies = BodyEvidence(
             candidates,
             self._count(candidates, "body")[:, 0],
@@ -188,15 +188,14 @@ class JointFusion:
         squared = confidence(table[:, 0], table[:, 1]) ** 2
         found = gather_candidates(labels, known.T_world_object[order], squared, ambiguity)
         views = [(view.measured, view.memo) for view in self._sorted_views()]
-        refined = BodyCandidates(
-            self._bodies.refine(found.T_world_object, views), found.place, found.evidence, found.twin
+        return merge_duplicates(
+            replace(found, T_world_object=self._bodies.refine(found.T_world_object, views)), ambiguity
         )
-        return merge_duplicates(refined, ambiguity)
 
     def _count(self, candidates: BodyCandidates, part: str) -> np.ndarray:
         """(K, r or 1, CASES) counts over all views, of the samples that the ambiguity has of a part."""
         ambiguity = self.ambiguity
-        rounded, keys = round_poses(candidates.T_world_object, _LATTICE)
+        rounded, keys = _rounded(candidates)
         samples: VisibleSamples = getattr(ambiguity, f"{part}_samples")
         rotations = ambiguity.rotations if part == "telling" else np.eye(4)[None]
         total = np.zeros((len(keys), len(rotations), CASES), np.int64)
@@ -213,7 +212,7 @@ class JointFusion:
 
     def _in_container(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:
         """(K, r, 5), see :func:`.against_container`."""
-        rounded, keys = round_poses(candidates.T_world_object, _LATTICE)
+        rounded, keys = _rounded(candidates)
 
         def compute(missing: np.ndarray) -> np.ndarray:
             return against_container(rounded[missing], part.rotations, part.points, self._tray)
@@ -225,7 +224,7 @@ class JointFusion:
     ) -> np.ndarray:
         """(K, r, 2) overlap with the most evident bodies of other places, given as rounded poses and their keys."""
         ambiguity, solid = self.ambiguity, self.ambiguity.solid
-        rounded, keys = round_poses(candidates.T_world_object, _LATTICE)
+        rounded, keys = _rounded(candidates)
         middles, others = (transform_points(T, ambiguity.middle[None])[:, 0] for T in (rounded, heads[0]))
         apart = np.linalg.norm(middles[:, None] - others, axis=-1)
         other = candidates.place[:, None] != np.arange(len(others))
@@ -278,7 +277,7 @@ class JointFusion:
             if len(now):
                 box[row], depth[row] = table[now[0], 2:6], table[now[0], 6]
             columns.append((*table[mine[0], :2], len(np.unique(stamps[mine])), distances[np.ix_(mine, mine)].max()))
-        verification, score, support, spread = np.array(columns).T
+        verification, score, support, spread = np.array(columns).reshape(-1, 4).T
         objects = SceneObjects(
             T[kept],
             verification,
@@ -311,3 +310,8 @@ class JointFusion:
         """The objects of all views so far, most probable first; arguments and features as for
         :meth:`.SceneFusion.objects`."""
         return self.describe(stamp, T_world_camera, camera).objects
+
+
+def _rounded(candidates: BodyCandidates) -> tuple[np.ndarray, list[bytes]]:
+    """(K, 4, 4) poses at which evidence is taken, and their keys."""
+    return round_poses(candidates.T_world_object, candidates.T_world_start, _LATTICE)

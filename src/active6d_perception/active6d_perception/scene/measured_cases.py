@@ -9,7 +9,7 @@ import numpy as np
 
 from active6d_perception.compiled import compiled
 from active6d_perception.model.visible_samples import VisibleSamples, direction_of
-from active6d_perception.scene.measured_view import MeasuredView
+from active6d_perception.scene.measured_view import NORMAL, MeasuredView
 
 #: Rows: looked through, measured a little behind, there but facing elsewhere, a little before, hidden, not measured,
 #: there and facing alike.
@@ -57,51 +57,52 @@ def count_cases(
                 there = T[axis, 0] * middle[0] + T[axis, 1] * middle[1] + T[axis, 2] * middle[2] + T[axis, 3]
                 square += (view.middles[index, axis] - there) ** 2
             own[index] = square < same_place * same_place
-        T_camera_object = view.T_camera_world @ T
-        for r in range(len(rotations)):
-            _count_pose(T_camera_object @ rotations[r], own, samples, view, counts[k, r])
+        _count_body(view.T_camera_world @ T, rotations, own, samples, view, counts[k])
     return counts
 
 
 @compiled
-def _count_pose(
-    P: np.ndarray, own: np.ndarray, samples: VisibleSamples, view: MeasuredView, counts: np.ndarray
+def _count_body(
+    T_camera_object: np.ndarray,
+    rotations: np.ndarray,
+    own: np.ndarray,
+    samples: VisibleSamples,
+    view: MeasuredView,
+    counts: np.ndarray,
 ) -> None:
-    """Add one (4, 4) pose's pixels to (:data:`CASES`,) ``counts``; (i,) ``own`` marks its instances."""
-    height, width = view.instance.shape
-    direction = direction_of(P, samples.nearest)
-    area = samples.area[direction] * view.fx * view.fy
-    for place in range(samples.number[direction]):
-        s = samples.chosen[direction, place]
-        a, b, c = samples.points[s, 0], samples.points[s, 1], samples.points[s, 2]
-        z = P[2, 0] * a + P[2, 1] * b + P[2, 2] * c + P[2, 3]
-        if z < 1e-3:
-            continue
-        x = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c + P[0, 3]
-        y = P[1, 0] * a + P[1, 1] * b + P[1, 2] * c + P[1, 3]
-        d, e, f = samples.normals[s, 0], samples.normals[s, 1], samples.normals[s, 2]
-        nx = P[0, 0] * d + P[0, 1] * e + P[0, 2] * f
-        ny = P[1, 0] * d + P[1, 1] * e + P[1, 2] * f
-        nz = P[2, 0] * d + P[2, 1] * e + P[2, 2] * f
-        u, v = int(np.rint(x / z * view.fx + view.cx)), int(np.rint(y / z * view.fy + view.cy))
-        what, whose = NOT_MEASURED, 2
-        if 0 <= u < width and 0 <= v < height:
-            behind = z - view.points[v, u, 2]
-            if behind < -_FAR:
-                what = LOOKED_THROUGH
-            elif behind < -_NEAR:
-                what = LITTLE_BEHIND
-            elif behind <= _NEAR:
-                normals = view.normals
-                cosine = normals[v, u, 0] * nx + normals[v, u, 1] * ny + normals[v, u, 2] * nz
-                what = FITTING if cosine > _ALIKE else FACING_ELSEWHERE
-            elif behind <= _FAR:
-                what = LITTLE_BEFORE
-            elif behind > _FAR:
-                what = HIDDEN
-            index = view.instance[v, u]
-            if index >= 0:
-                whose = 0 if own[index] else 1
-        # A sample that is seen at a slant covers fewer pixels.
-        slant = abs(nx * x + ny * y + nz * z) / np.sqrt(x * x + y * y + z * z)
-        counts[what * WHOSE + whose] += int(np.rint(PER_PIXEL * area * slant / (z * z)))
+    """Add one body's pixels to (r, :data:`CASES`) ``counts``; (i,) ``own`` marks its instances."""
+    height, width = view.depth.shape
+    for r in range(len(rotations)):
+        P = T_camera_object @ rotations[r]
+        direction = direction_of(P, samples.nearest)
+        area = PER_PIXEL * samples.area[direction] * view.fx * view.fy
+        for place in range(samples.number[direction]):
+            s = samples.chosen[direction, place]
+            a, b, c = samples.points[s, 0], samples.points[s, 1], samples.points[s, 2]
+            z = P[2, 0] * a + P[2, 1] * b + P[2, 2] * c + P[2, 3]
+            if z < 1e-3:
+                continue
+            x = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c + P[0, 3]
+            y = P[1, 0] * a + P[1, 1] * b + P[1, 2] * c + P[1, 3]
+            d, e, f = samples.normals[s, 0], samples.normals[s, 1], samples.normals[s, 2]
+            nx = P[0, 0] * d + P[0, 1] * e + P[0, 2] * f
+            ny = P[1, 0] * d + P[1, 1] * e + P[1, 2] * f
+            nz = P[2, 0] * d + P[2, 1] * e + P[2, 2] * f
+            u, v = int(np.rint(x / z * view.fx + view.cx)), int(np.rint(y / z * view.fy + view.cy))
+            what, whose = NOT_MEASURED, 2
+            if 0 <= u < width and 0 <= v < height:
+                behind = z - view.depth[v, u]
+                if abs(behind) <= _NEAR:
+                    normal = view.normals[v, u]
+                    alike = normal[0] * nx + normal[1] * ny + normal[2] * nz > _ALIKE * NORMAL
+                    what = FITTING if alike else FACING_ELSEWHERE
+                elif not np.isnan(behind):
+                    little = abs(behind) <= _FAR
+                    before, after = LITTLE_BEFORE if little else HIDDEN, LITTLE_BEHIND if little else LOOKED_THROUGH
+                    what = before if behind > 0 else after
+                index = view.instance[v, u]
+                if index >= 0:
+                    whose = 0 if own[index] else 1
+            # A sample that is seen at a slant covers fewer pixels.
+            slant = abs(nx * x + ny * y + nz * z) / np.sqrt(x * x + y * y + z * z)
+            counts[r, what * WHOSE + whose] += int(np.rint(area * slant / (z * z)))

@@ -10,6 +10,8 @@ from active6d_core.se3 import invert, transform_points
 from active6d_perception.compiled import compiled
 from active6d_perception.scene.ambiguity import Ambiguity
 
+#: Length of the stored normals.
+NORMAL = 127
 # Images are reduced by an integer factor to about this width in pixels.
 _WIDTH = 320
 
@@ -17,10 +19,10 @@ _WIDTH = 320
 class MeasuredView(NamedTuple):
     """A view for compiled loops."""
 
-    points: np.ndarray
-    """(h, w, 3) float32 measured points in the optical frame, metres, NaN invalid"""
+    depth: np.ndarray
+    """(h, w) float32 metres along z, NaN invalid"""
     normals: np.ndarray
-    """(h, w, 3) float32 unit normals facing the camera, NaN unknown"""
+    """(h, w, 3) int8 normals facing the camera, of length :data:`NORMAL`; 0 unknown"""
     instance: np.ndarray
     """(h, w) int16 index of the pixel's instance, -1 without one"""
     middles: np.ndarray
@@ -66,41 +68,39 @@ def measure_view(
     instance = index_of[hypotheses.segmentation[::factor, ::factor][: small.height, : small.width]]
     middles = transform_points(T_world_camera @ hypotheses.T_camera_object[first], ambiguity.middle[None])[:, 0]
     intrinsics = small.fx, small.fy, small.cx, small.cy
-    points, normals = _surface(np.ascontiguousarray(z), intrinsics)
-    return MeasuredView(points, normals, instance, middles, invert(T_world_camera), *intrinsics)
+    z = np.ascontiguousarray(z)
+    return MeasuredView(z, _normals(z, intrinsics), instance, middles, invert(T_world_camera), *intrinsics)
 
 
 @compiled
-def _surface(depth: np.ndarray, intrinsics: tuple[float, float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals of a depth image, as :func:`active6d_core.camera.normals_from_points` over one pixel."""
+def _normals(depth: np.ndarray, intrinsics: tuple[float, float, float, float]) -> np.ndarray:
+    """(h, w, 3) int8 normals, as :func:`active6d_core.camera.normals_from_points` over one pixel."""
     height, width = depth.shape
-    fx, fy, cx, cy = intrinsics
-    points = np.empty((height, width, 3), np.float32)
-    normals = np.full((height, width, 3), np.nan, np.float32)
-    for v in range(height):
-        for u in range(width):
-            z = depth[v, u]
-            points[v, u, 0] = np.float32((u - cx) / fx) * z
-            points[v, u, 1] = np.float32((v - cy) / fy) * z
-            points[v, u, 2] = z
+    normals = np.zeros((height, width, 3), np.int8)
     for v in range(1, height - 1):
         for u in range(1, width - 1):
-            ax, ay, az = _difference(points, v + 1, u, v - 1, u)
-            bx, by, bz = _difference(points, v, u + 1, v, u - 1)
+            ax, ay, az = _difference(depth, v + 1, u, v - 1, u, intrinsics)
+            bx, by, bz = _difference(depth, v, u + 1, v, u - 1, intrinsics)
             x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
             length = np.sqrt(x * x + y * y + z * z)
-            if length > 0:
-                facing = x * points[v, u, 0] + y * points[v, u, 1] + z * points[v, u, 2]
-                length = -length if facing > 0 else length
-                normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = x / length, y / length, z / length
-    return points, normals
+            if length > 0 and np.isfinite(depth[v, u]):
+                fx, fy, cx, cy = intrinsics
+                facing = x * (u - cx) / fx + y * (v - cy) / fy + z
+                scale = (-NORMAL if facing > 0 else NORMAL) / length
+                normals[v, u, 0], normals[v, u, 1] = np.rint(x * scale), np.rint(y * scale)
+                normals[v, u, 2] = np.rint(z * scale)
+    return normals
 
 
 @compiled
-def _difference(points: np.ndarray, v: int, u: int, from_v: int, from_u: int) -> tuple[float, float, float]:
+def _difference(
+    depth: np.ndarray, v: int, u: int, from_v: int, from_u: int, intrinsics: tuple[float, float, float, float]
+) -> tuple[float, float, float]:
     """The vector between the points of two pixels."""
+    fx, fy, cx, cy = intrinsics
+    z, from_z = float(depth[v, u]), float(depth[from_v, from_u])
     return (
-        points[v, u, 0] - points[from_v, from_u, 0],
-        points[v, u, 1] - points[from_v, from_u, 1],
-        points[v, u, 2] - points[from_v, from_u, 2],
+        (u - cx) / fx * z - (from_u - cx) / fx * from_z,
+        (v - cy) / fy * z - (from_v - cy) / fy * from_z,
+        z - from_z,
     )

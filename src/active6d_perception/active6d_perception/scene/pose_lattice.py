@@ -2,19 +2,27 @@
 
 import numpy as np
 
+from active6d_core.se3 import invert
 from active6d_perception.compiled import compiled
 
 # Steps of a quaternion per metre: rotations are rounded by half a degree where positions are by 0.5 mm.
 _QUATERNION = 1 / 0.256
 
 
-def round_poses(T: np.ndarray, step: float) -> tuple[np.ndarray, list[bytes]]:
-    """Round (k, 4, 4) poses in metres: (k, 4, 4) poses on a lattice, and a key of each.
+def round_poses(T: np.ndarray, origin: np.ndarray, step: float) -> tuple[np.ndarray, list[bytes]]:
+    """Round poses to lattices around their origins.
 
-    Positions are multiples of ``step``, metres.
+    Args:
+        T: (k, 4, 4) metres.
+        origin: (k, 4, 4) poses that are on the lattices, such as those that refinement started from.
+        step: of positions, metres.
+
+    Returns:
+        (k, 4, 4) rounded poses, and a key of each.
     """
-    rounded, steps = _round(np.ascontiguousarray(T, float), step)
-    return rounded, [row.tobytes() for row in steps]
+    offset, steps = _round(invert(origin) @ T, step)
+    names = np.ascontiguousarray(origin[:, :3], float)
+    return origin @ offset, [name.tobytes() + row.tobytes() for name, row in zip(names, steps, strict=True)]
 
 
 @compiled

@@ -52,20 +52,22 @@ def solid_of(model: ObjectModel, rotations: np.ndarray) -> Solid:
 
 
 @compiled
-def signed_distance(x: float, y: float, z: float, solid: Solid) -> float:
-    """Signed distance of a point in the object frame, metres; ``inf`` outside of the grid."""
-    i, j, k = (x - solid.low[0]) / solid.cell, (y - solid.low[1]) / solid.cell, (z - solid.low[2]) / solid.cell
-    nx, ny, nz = solid.distance.shape
-    if not (0 <= i < nx - 1 and 0 <= j < ny - 1 and 0 <= k < nz - 1):
-        return np.inf
-    a, b, c = int(i), int(j), int(k)
-    u, v, w = i - a, j - b, k - c
-    d = solid.distance
-    near = (d[a, b, c] * (1 - w) + d[a, b, c + 1] * w) * (1 - v) + (
-        d[a, b + 1, c] * (1 - w) + d[a, b + 1, c + 1] * w
-    ) * v
-    a += 1
-    far = (d[a, b, c] * (1 - w) + d[a, b, c + 1] * w) * (1 - v) + (
-        d[a, b + 1, c] * (1 - w) + d[a, b + 1, c + 1] * w
-    ) * v
-    return near * (1 - u) + far * u
+def signed_distances(points: np.ndarray, solid: Solid) -> np.ndarray:
+    """(n,) signed distances of (n, 3) points in the object frame, metres; ``inf`` outside of the grid."""
+    result = np.full(len(points), np.inf)
+    d, (nx, ny, nz) = solid.distance, solid.distance.shape
+    for index in range(len(points)):
+        i = (points[index, 0] - solid.low[0]) / solid.cell
+        j = (points[index, 1] - solid.low[1]) / solid.cell
+        k = (points[index, 2] - solid.low[2]) / solid.cell
+        if not (0 <= i < nx - 1 and 0 <= j < ny - 1 and 0 <= k < nz - 1):
+            continue
+        a, b, c = int(i), int(j), int(k)
+        u, v, w = i - a, j - b, k - c
+        near = (d[a, b, c] * (1 - w) + d[a, b, c + 1] * w) * (1 - v)
+        near += (d[a, b + 1, c] * (1 - w) + d[a, b + 1, c + 1] * w) * v
+        a += 1
+        far = (d[a, b, c] * (1 - w) + d[a, b, c + 1] * w) * (1 - v)
+        far += (d[a, b + 1, c] * (1 - w) + d[a, b + 1, c + 1] * w) * v
+        result[index] = near * (1 - u) + far * u
+    return result
