@@ -5,6 +5,8 @@ import re
 import runpy
 import sys
 from functools import cache
+from importlib import metadata
+from operator import itemgetter
 from pathlib import Path
 from unittest import mock
 
@@ -43,6 +45,23 @@ LIBRARIES = {
     "typer": (None, "typer"),
     "yaml": ("python3-yaml", "pyyaml"),
     "zstandard": (None, "zstandard"),
+}
+# How rosdep resolves each key on Ubuntu 24.04: (by apt or by pip, package), copied from rosdep/python.yaml of
+# github.com/ros/rosdistro at 8468e88c (2026-08-22). Look a new key up there before it is added.
+ROSDEP = {
+    "mcap-ros2-support": ("pip", "mcap-ros2-support"),
+    "python3-gymnasium-pip": ("pip", "gymnasium"),
+    "python3-jinja2": ("apt", "python3-jinja2"),
+    "python3-matplotlib": ("apt", "python3-matplotlib"),
+    "python3-numpy": ("apt", "python3-numpy"),
+    "python3-opencv": ("apt", "python3-opencv"),
+    "python3-pil": ("apt", "python3-pil"),
+    "python3-pybullet-pip": ("pip", "pybullet"),
+    "python3-pytest": ("apt", "python3-pytest"),
+    "python3-rosbags-pip": ("pip", "rosbags"),
+    "python3-stable-baselines3-pip": ("pip", "stable-baselines3"),
+    "python3-trimesh-pip": ("pip", "trimesh"),
+    "python3-yaml": ("apt", "python3-yaml"),
 }
 # What a package needs and no import shows: `ros2 launch` itself, and the packages whose nodes bringup loads by name.
 NOT_IMPORTED = {"active6d_bringup": {"active6d_agent", "active6d_perception", "ros2launch"}}
@@ -137,6 +156,22 @@ def test_what_rosdep_has_no_key_for_is_in_the_docker_requirements():
     without_key = {LIBRARIES[name][1] for name in imported & LIBRARIES.keys() if LIBRARIES[name][0] is None}
     lines = (ROOT / "docker/requirements.txt").read_text().splitlines()
     assert without_key == {re.split("[=<>]", line)[0] for line in lines if not line.startswith("#")}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_rosdep_resolves_every_key(package):
+    """So ``rosdep install`` needs no skipped keys."""
+    manifest = parse_package(ROOT / "src" / package / "package.xml")
+    keys = {dependency.name for dependency in [*manifest.exec_depends, *manifest.test_depends]}
+    assert keys <= ROSDEP.keys() | ROS | set(PACKAGES)
+
+
+def test_rosdep_installs_what_is_imported():
+    """What a key installs by pip is the pinned library, or brings it along."""
+    for key, library in filter(itemgetter(0), LIBRARIES.values()):
+        installer, package = ROSDEP[key]
+        if installer == "pip" and package != library:
+            assert library in {re.split("[^a-z-]", name)[0] for name in metadata.requires(package)}, key
 
 
 def test_only_the_simulator_asks_rosdep_for_pybullet():

@@ -32,6 +32,7 @@ from active6d_core.ros.conversions import (
     poses_from_array,
     stamp_to_ns,
 )
+from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, episode_info
 from active6d_core.ros.topics import (
     CAMERA_POSE,
     CAMERA_TOPICS,
@@ -178,15 +179,15 @@ def _episode(
         return [message for stamp, message in sorted(messages[topic].items()) if start <= stamp < limit]
 
     world = messages[CAMERA_POSE.name][start].header.frame_id
-    truth, ends = within(GROUND_TRUTH.name), within(EPISODE_END.name)
-    # The camera's word comes last: both sides say their seed, and the camera's is the one of the heap.
-    statuses = [status for message in (*ends, *within(EPISODE_START.name)) for status in message.status]
+    truth = within(GROUND_TRUTH.name)
+    begun = [EpisodeStart.from_message(message) for message in within(EPISODE_START.name)]
+    ended = [EpisodeEnd.from_message(message) for message in within(EPISODE_END.name)]
     return EpisodeRecord(
         folder=index.folder,
-        info={pair.key: pair.value for status in statuses for pair in status.values},
+        info=episode_info(begun, ended),
         steps=[_step(messages, latencies.get(view, {}), view, world) for view in views if start <= view < limit],
         ground_truth=poses_from_array(truth[-1], world) if truth else None,
-        end_reason=ends[-1].status[0].message if ends and ends[-1].status else None,
+        end_reason=ended[-1].reason if ended else None,
         world_frame=world,
         damage=index.damage,
     )

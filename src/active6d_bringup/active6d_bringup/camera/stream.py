@@ -29,7 +29,6 @@ class FrameMatcher:
         self._waiting: dict[str, deque[tuple[int, Any]]] = {
             name: deque(maxlen=_KEPT_FRAMES) for name in ("color", "depth")
         }
-        self._since_pair = 0
         #: Pairs so far, and images that found no partner.
         self.pairs = self.unmatched = 0
         #: Smallest difference (ns) of stamps among images that found no partner since the last pair; None before any.

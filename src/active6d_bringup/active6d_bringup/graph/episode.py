@@ -37,7 +37,7 @@ from active6d_core.ros.conversions import (
     poses_from_array,
     stamp_to_ns,
 )
-from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart
+from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, episode_info
 from active6d_core.ros.node import qos_of
 from active6d_core.view_sphere import ViewSphere
 
@@ -300,7 +300,8 @@ class EpisodeMonitor(Node):
         self._hypotheses: dict[int, int] = {}
         self._latencies: dict[int, dict[str, float]] = {}
         self._ground_truth: np.ndarray | None = None
-        self._info: dict[str, str] = {}
+        self._starts: list[EpisodeStart] = []
+        self._ends: list[EpisodeEnd] = []
         self._reason = ""
         self._began = self._ended = 0.0
         self._listen(topics.CAMERA_POSE, self._on_pose)
@@ -334,7 +335,7 @@ class EpisodeMonitor(Node):
         steps = [self._step(index, stamp) for index, stamp in enumerate(sorted(self._poses.keys() & self._objects))]
         return EpisodeResult(
             settings=settings,
-            info=self._info,
+            info=episode_info(self._starts, self._ends),
             steps=steps,
             ground_truth=self._ground_truth,
             reason=self._reason,
@@ -396,12 +397,11 @@ class EpisodeMonitor(Node):
         self._ground_truth = poses_from_array(message, message.header.frame_id)
 
     def _on_start(self, message: DiagnosticArray) -> None:
-        self._info.update(EpisodeStart.from_message(message).info)
+        self._starts.append(EpisodeStart.from_message(message))
 
     def _on_end(self, message: DiagnosticArray) -> None:
         end = EpisodeEnd.from_message(message)
-        # Both sides give their seed; the camera's is the one of the pile.
-        self._info = {**end.info, **self._info}
+        self._ends.append(end)
         self.end_stamp, self._reason = end.stamp, end.reason
         self._ended = time.monotonic()
 

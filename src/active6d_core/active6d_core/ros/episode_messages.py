@@ -4,13 +4,14 @@ On the wire all of them are a DiagnosticArray with one status. They need its cla
 objects of rosbags as well.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from active6d_core.ros.conversions import HARDWARE_ID, MessageError, make_header, stamp_to_ns
+from active6d_core.ros.conversions import HARDWARE_ID, MessageError, make_header, stamp_to_ns, status_values
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,12 @@ class EpisodeEnd:
         """Read a message; one without a status has no reason."""
         reason = message.status[0].message if message.status else ""
         return cls(stamp_to_ns(message.header.stamp), message.header.frame_id, reason, _values(message))
+
+
+def episode_info(starts: Iterable[EpisodeStart], ends: Iterable[EpisodeEnd]) -> dict[str, str]:
+    """What the messages of one episode say about it; of the seeds, the camera's is kept: it is the pile's."""
+    messages: list[EpisodeStart | EpisodeEnd] = [*ends, *starts]
+    return {key: value for message in messages for key, value in message.info.items()}
 
 
 class GoalState(Enum):
@@ -125,4 +132,4 @@ def _to_message(stamp: int, frame: str, status: DiagnosticStatus) -> DiagnosticA
 
 
 def _values(message: Any) -> dict[str, str]:
-    return {pair.key: pair.value for status in message.status for pair in status.values}
+    return {key: value for status in message.status for key, value in status_values(status).items()}

@@ -112,10 +112,6 @@ class Appearance:
         directions = np.random.default_rng([self.seed, 5]).normal(size=(4, 3)) + (0.0, 0.0, 0.7)
         return (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
 
-    def with_seed(self, seed: int) -> "Appearance":
-        """The same appearance with other tints and textures."""
-        return replace(self, seed=seed)
-
     def instance_colors(self, count: int, model_color: np.ndarray) -> np.ndarray:
         """(count, 3) float32 linear colour of each instance; ``model_color`` is sRGB as in the object's description."""
         rng = np.random.default_rng([self.seed, 1])
