@@ -2,11 +2,11 @@
 """Compare settings of pose refinement on views of the validation split, starting near the true poses.
 
 The network segments the objects. Every object that is at least a tenth visible starts 6 degrees and 4 mm off its true
-pose. The shards are those of compare_decodings.
+pose. The shards are the validation views that 'active6d train estimator' renders.
 
 Example: python -m active6d_tools.studies.compare_refinements mug
     src/active6d_perception/active6d_perception/estimators/dense/weights/mug.safetensors
-    ~/.cache/active6d/training/mug/validation/*.npz
+    ~/.cache/active6d/training/mug/val/*.npz
 """
 
 from time import process_time

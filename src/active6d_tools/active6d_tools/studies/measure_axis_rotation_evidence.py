@@ -6,7 +6,7 @@ shards are training views that the network was not trained on.
 
 Example: python -m active6d_tools.studies.measure_axis_rotation_evidence mug
     src/active6d_perception/active6d_perception/estimators/dense/weights/mug.safetensors
-    ~/.cache/active6d/training/mug/validation/*.npz
+    ~/.cache/active6d/training/mug/val/*.npz
 """
 
 import numpy as np
