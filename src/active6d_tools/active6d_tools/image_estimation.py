@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -131,7 +132,7 @@ def bop_csv(results: Sequence[ImageResult], model: ObjectModel, object_id: int) 
     return file.getvalue()
 
 
-def describe(results: Sequence[ImageResult], model: ObjectModel) -> list[dict]:
+def describe(results: Sequence[ImageResult], model: ObjectModel) -> list[dict[str, Any]]:
     """Results as JSON rows, one per image."""
     return [
         {

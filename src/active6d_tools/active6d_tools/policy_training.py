@@ -31,7 +31,7 @@ class PolicyTraining:
         """The weights with the best validation result."""
         return self.folder / BEST
 
-    def curve(self) -> list[dict]:
+    def curve(self) -> list[dict[str, Any]]:
         """The validation results so far."""
         return [json.loads(line) for line in (self.folder / "curve.jsonl").read_text().splitlines()]
 
@@ -43,7 +43,7 @@ def plan_training(
     steps: int,
     seed: int = 0,
     length: int | None = None,
-    groups: dict[str, dict] | None = None,
+    groups: dict[str, dict[str, Any]] | None = None,
     resume: bool = False,
 ) -> PolicyTraining:
     """A training of "view-attention" (DAgger) or "attention" (PPO); nothing starts yet.
@@ -64,7 +64,9 @@ def plan_training(
     return plan(folder, {"steps": steps, "seed": seed}, length, groups or {}, resume)
 
 
-def _plan_dagger(folder: Path, common: dict, length: int | None, groups: dict, resume: bool) -> PolicyTraining:
+def _plan_dagger(
+    folder: Path, common: dict[str, Any], length: int | None, groups: dict[str, Any], resume: bool
+) -> PolicyTraining:
     from active6d_agent.policies.view_attention.dagger import DaggerParameters, train_dagger
     from active6d_agent.policies.view_attention.network import Weighing
 
@@ -79,7 +81,9 @@ def _plan_dagger(folder: Path, common: dict, length: int | None, groups: dict, r
     )
 
 
-def _plan_ppo(folder: Path, common: dict, length: int | None, groups: dict, resume: bool) -> PolicyTraining:
+def _plan_ppo(
+    folder: Path, common: dict[str, Any], length: int | None, groups: dict[str, Any], resume: bool
+) -> PolicyTraining:
     from active6d_agent.environment.episodes import RewardParameters
     from active6d_agent.policies.attention.ppo import PpoParameters, train_ppo
 
@@ -98,7 +102,7 @@ def _plan_ppo(folder: Path, common: dict, length: int | None, groups: dict, resu
     )
 
 
-def _make(kind: type, group: str, own: dict, groups: dict[str, dict]) -> Any:
+def _make(kind: type, group: str, own: dict[str, Any], groups: dict[str, dict[str, Any]]) -> Any:
     """A dataclass of parameters from defaults of the command and what ``--set`` gives for its group.
 
     Raises:
@@ -115,7 +119,7 @@ def _make(kind: type, group: str, own: dict, groups: dict[str, dict]) -> Any:
         raise ValueError(f"--set {group}: {error}") from error
 
 
-def _refuse_others(groups: dict[str, dict], known: tuple[str, ...]) -> None:
+def _refuse_others(groups: dict[str, dict[str, Any]], known: tuple[str, ...]) -> None:
     others = sorted(groups.keys() - set(known))
     if others:
         raise ValueError(f"--set {others[0]}: known are {', '.join(known)}")

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from concurrent.futures import as_completed
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def render_missing(
     Raises:
         ValueError: the stored scenes are missing; the message says how to make them.
     """
-    tasks: dict[Path, tuple[Callable, tuple]] = {}
+    tasks: dict[Path, tuple[Callable[..., None], tuple[Any, ...]]] = {}
     for split in VALIDATION_SPLITS:
         for index in range(SPLITS[split]):
             path = folder / split / f"{index}.npz"

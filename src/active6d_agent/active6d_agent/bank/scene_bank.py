@@ -15,6 +15,7 @@ from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -140,7 +141,7 @@ def build_bank(
     observe: Callable[[str], BankScene],
     *,
     workers: int = 1,
-    provenance: dict | None = None,
+    provenance: dict[str, Any] | None = None,
     sphere: ViewSphere | None = None,
     grid: SurfaceGrid | None = None,
 ) -> Iterator[str]:
@@ -214,7 +215,7 @@ class SceneBank:
     sphere: ViewSphere
     grid: SurfaceGrid
     scenes: Sequence[BankScene]
-    provenance: dict
+    provenance: dict[str, Any]
 
     def __post_init__(self) -> None:
         expected = len(self.sphere), -(-len(self.grid) // 8)

@@ -70,14 +70,16 @@ class Active6DEnv(gym.Env):
         self.episodes = Episodes(_open(bank), 1, **settings)
         self.observation_space, self.action_space = make_spaces(self.episodes.steps)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode."""
         super().reset(seed=seed)
         options = options or {}
         self.episodes.begin(np.zeros(1, int), self.np_random, options.get("scene"), options.get("view"))
         return self._observe(), {"view": int(self.episodes.current[0])}
 
-    def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Take the next view."""
         reward, done = self.episodes.move(np.asarray(action, float)[None])
         info: dict[str, Any] = {"view": int(self.episodes.current[0])}
@@ -112,14 +114,18 @@ class Active6DVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin all episodes; ``options`` may fix the (E,) ``scene`` and ``view``."""
         super().reset(seed=seed)
         options = options or {}
         self.episodes.begin(np.arange(self.num_envs), self.np_random, options.get("scene"), options.get("view"))
         return self.episodes.observe(), {}
 
-    def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Move all cameras."""
         reward, done = self.episodes.move(np.asarray(actions, float))
         info: dict[str, Any] = {}

@@ -7,6 +7,7 @@ Every ablation yields rows for a table: ``variant`` says what was varied, the ot
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,8 +39,8 @@ def ablate_steps(
     steps: Sequence[int] = STEPS,
     *,
     seed: int = 0,
-    parameters: dict[str, dict] | None = None,
-) -> Iterator[dict]:
+    parameters: dict[str, dict[str, Any]] | None = None,
+) -> Iterator[dict[str, Any]]:
     """Policies with budgets from the single view to all views; ``budget`` is T.
 
     Args:
@@ -60,8 +61,8 @@ def ablate_steps(
 
 
 def ablate_planning(
-    lookup: BatchedFusion, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict | None = None
-) -> Iterator[dict]:
+    lookup: BatchedFusion, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict[str, Any] | None = None
+) -> Iterator[dict[str, Any]]:
     """``view-attention`` as it is, then with one parameter of :data:`PLANNING` set, then Random; nothing is trained.
 
     ``parameter`` is the parameter's name, "as shipped" or "random", ``value`` its value or None, ``moves`` the mean
@@ -90,7 +91,7 @@ def ablate_planning(
 
 def ablate_fusion(
     bank: SceneBank, policy: str, starts: np.ndarray, steps: int, *, seed: int = 0, scores: bool = False
-) -> Iterator[dict]:
+) -> Iterator[dict[str, Any]]:
     """The deployed fusion, and without one of its parts.
 
     The views are the same for all variants, those that ``policy`` takes with the deployed fusion, so that only fusion
@@ -168,7 +169,7 @@ def ablate_training(
     *,
     seed: int = 0,
     on_progress: Callable[[str, int], None] = lambda name, steps: None,
-) -> Iterator[dict]:
+) -> Iterator[dict[str, Any]]:
     """Train the paper's policy in several variants and evaluate each; every row is compared with the first one.
 
     A training is known by what is varied, not by its name: one that an earlier call, perhaps of another ablation, has

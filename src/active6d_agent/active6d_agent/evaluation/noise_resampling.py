@@ -6,6 +6,7 @@ planner can predict the noise of an image that it has not taken. So a part of th
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import SceneBank
 from active6d_agent.environment.rollout import measure
 from active6d_agent.evaluation.oracle import worth
-from active6d_agent.evaluation.policy_evaluation import Intervals, describe, run_named
+from active6d_agent.evaluation.policy_evaluation import Intervals, Measures, describe, run_named
 from active6d_core.view_sphere import ViewSphere
 
 
@@ -24,8 +25,8 @@ def ablate_noise_resampling(
     steps: int,
     *,
     seed: int = 0,
-    parameters: dict[str, dict] | None = None,
-) -> Iterator[dict]:
+    parameters: dict[str, dict[str, Any]] | None = None,
+) -> Iterator[dict[str, Any]]:
     """Policies choose their views on either bank; the views are scored on that bank and on the other one.
 
     Yields a row for each ``policy`` and ``noise``, the mean over both banks. Noise "own" is that of the images that the
@@ -52,7 +53,7 @@ def ablate_noise_resampling(
         own = (parameters or {}).get(name)
         return [run_named(lookup, name, starts, steps, seed=seed, parameters=own).views for lookup in lookups]
 
-    def score(views: list[np.ndarray], noise: Sequence[BatchedFusion] = lookups) -> dict[str, np.ndarray]:
+    def score(views: list[np.ndarray], noise: Sequence[BatchedFusion] = lookups) -> Measures:
         ways = [measure(lookup, scene, own).measures for lookup, own in zip(noise, views, strict=True)]
         return {key: np.mean([way[key] for way in ways], axis=0) for key in ways[0]}
 
@@ -61,7 +62,7 @@ def ablate_noise_resampling(
     if high.mean() <= low.mean():
         raise ValueError("the oracle finds no more than Random from these starts; take more of them")
 
-    def row(name: str, noise: str, measures: dict, first: dict | None = None) -> dict:
+    def row(name: str, noise: str, measures: Measures, first: Measures | None = None) -> dict[str, Any]:
         lead, gap = measures["detection_rate"] - low, high - low
         shares = {f"gap_closed_{kind}": ends for kind, ends in intervals.of_ratio(lead, gap).items()}
         gap_closed = {"gap_closed": float(lead.mean() / gap.mean()), **shares}
@@ -82,7 +83,7 @@ def ablate_noise_resampling(
 def _refuse_other_scenes(bank: SceneBank, other: SceneBank) -> None:
     """Raise ValueError unless two banks differ in nothing but the seed of the noise."""
 
-    def made(bank: SceneBank) -> tuple:
+    def made(bank: SceneBank) -> tuple[Any, ...]:
         scenes = [(scene.name, scene.T_world_object.tolist()) for scene in bank.scenes]
         return bank.sphere, bank.grid, {**bank.provenance, "seed": None}, scenes
 

@@ -1,6 +1,7 @@
 """The paper's Table 1 on a bank: every policy and the bounds from the same starts, with paired intervals."""
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,9 @@ BOUNDS = ("oracle", "all-views")
 _RESAMPLES = 2000
 # Episodes between two reports of progress.
 _TOGETHER = 100
+
+#: Name of a measure of an episode to (E,) values, one per episode.
+Measures = dict[str, np.ndarray]
 
 
 def all_starts(lookup: BatchedFusion, sample: int | None = None, seed: int = 0) -> np.ndarray:
@@ -60,7 +64,13 @@ def run_policy(
 
 
 def run_named(
-    lookup: BatchedFusion, name: str, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict | None = None
+    lookup: BatchedFusion,
+    name: str,
+    starts: np.ndarray,
+    steps: int,
+    *,
+    seed: int = 0,
+    parameters: dict[str, Any] | None = None,
 ) -> EpisodeResults:
     """Run a policy or a bound by name.
 
@@ -149,7 +159,7 @@ def evaluate(
     starts: np.ndarray,
     *,
     seed: int = 0,
-    parameters: dict[str, dict] | None = None,
+    parameters: dict[str, dict[str, Any]] | None = None,
     on_progress: Callable[[str, int], None] = lambda name, episodes: None,
 ) -> Iterator[tuple[str, EpisodeResults]]:
     """Run every policy from the same starts; yields each as it is done.
@@ -172,19 +182,19 @@ def evaluate(
         yield name, EpisodeResults(*map(np.concatenate, columns))
 
 
-def describe(measures: dict[str, np.ndarray], intervals: Intervals, first: dict[str, np.ndarray] | None = None) -> dict:
+def describe(measures: Measures, intervals: Intervals, first: Measures | None = None) -> dict[str, Any]:
     """The mean of each measure (E,) as ``name``, with ``name_ci95`` and ``name_ci95_scenes`` (:class:`Intervals`).
 
     With ``first``, also ``against_first``: the paired differences to those measures (:func:`compare`).
     """
-    row: dict = {}
+    row: dict[str, Any] = {}
     for name, values in measures.items():
         row[name] = float(values.mean())
         row |= {f"{name}_{kind}": interval for kind, interval in intervals.of(values).items()}
     return row if first is None else {**row, "against_first": compare(measures, first, intervals)}
 
 
-def compare(own: dict[str, np.ndarray], other: dict[str, np.ndarray], intervals: Intervals) -> dict[str, dict]:
+def compare(own: Measures, other: Measures, intervals: Intervals) -> dict[str, dict[str, Any]]:
     """Paired differences of each measure (E,), positive where ``own`` is higher.
 
     They are ``mean``, both intervals, and whether these exclude zero (``excludes_zero``, ``excludes_zero_scenes``).
@@ -198,7 +208,7 @@ def compare(own: dict[str, np.ndarray], other: dict[str, np.ndarray], intervals:
     return table
 
 
-def summarise(results: dict[str, EpisodeResults], object_name: str, steps: int, seed: int = 0) -> dict:
+def summarise(results: dict[str, EpisodeResults], object_name: str, steps: int, seed: int = 0) -> dict[str, Any]:
     """The table: means with 95 % intervals, paired differences to every other policy, and the share of the gap closed.
 
     Args:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ def compare_seeds(
     *,
     sample: int | None = None,
     seed: int = 0,
-) -> Iterator[dict]:
+) -> Iterator[dict[str, Any]]:
     """Evaluate trainings of policies on test scenes and on the validation scenes that the shipped one is chosen by.
 
     Args:
@@ -51,7 +52,7 @@ def compare_seeds(
         }
 
 
-def mark_best(rows: list[dict]) -> None:
+def mark_best(rows: list[dict[str, Any]]) -> None:
     """Set ``best_on_validation`` in rows of :func:`compare_seeds`: the best training of each policy."""
     for policy in {row["policy"] for row in rows}:
         own = [row for row in rows if row["policy"] == policy]

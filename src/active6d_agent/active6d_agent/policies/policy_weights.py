@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from safetensors.torch import load_file, save_file
 from torch import nn
@@ -13,7 +13,9 @@ from active6d_core.files import atomic_file, write_file
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
-def save_weights(module: nn.Module, path: Path, policy: str, config: dict, provenance: dict | None = None) -> None:
+def save_weights(
+    module: nn.Module, path: Path, policy: str, config: dict[str, Any], provenance: dict[str, Any] | None = None
+) -> None:
     """Write ``path`` (.safetensors) and the configuration that :func:`load_weights` builds from beside it (.json)."""
     with atomic_file(path) as unfinished:
         save_file({name: value.detach().cpu().clone() for name, value in module.state_dict().items()}, unfinished)
@@ -21,7 +23,7 @@ def save_weights(module: nn.Module, path: Path, policy: str, config: dict, prove
     write_file(path.with_suffix(".json"), json.dumps(document, indent=2) + "\n")
 
 
-def load_weights(path: Path, policy: str, build: Callable[[dict], _Module], remedy: str = "") -> _Module:
+def load_weights(path: Path, policy: str, build: Callable[[dict[str, Any]], _Module], remedy: str = "") -> _Module:
     """Read what :func:`save_weights` wrote.
 
     Args:

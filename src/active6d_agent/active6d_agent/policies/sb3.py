@@ -6,6 +6,7 @@ beside them. Loading them executes nothing. Stable-Baselines3 must be installed 
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from stable_baselines3 import A2C, PPO, SAC, TD3
@@ -51,7 +52,7 @@ def export_model(model: BaseAlgorithm, path: Path) -> None:
     save_weights(model.policy, path, "sb3", config)
 
 
-def _build(config: dict) -> BasePolicy:
+def _build(config: dict[str, Any]) -> BasePolicy:
     return _ALGORITHMS[config["algorithm"]].policy_aliases["MultiInputPolicy"](
         *make_spaces(config["steps"]),
         lambda _: 0.0,

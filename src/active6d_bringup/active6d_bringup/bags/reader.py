@@ -160,7 +160,9 @@ def _read_messages(index: BagIndex) -> tuple[dict[str, dict[int, Any]], dict[int
     return messages, latencies
 
 
-def _episodes(index: BagIndex, messages: dict[str, dict[int, Any]], latencies: dict) -> list[EpisodeRecord]:
+def _episodes(
+    index: BagIndex, messages: dict[str, dict[int, Any]], latencies: dict[int, dict[str, float]]
+) -> list[EpisodeRecord]:
     views = sorted(set.intersection(*(set(messages[topic.name]) for topic in CAMERA_TOPICS)))
     if not views:
         what = "holds no complete view (color, depth, camera_info and pose of one stamp)"
@@ -171,7 +173,12 @@ def _episodes(index: BagIndex, messages: dict[str, dict[int, Any]], latencies: d
 
 
 def _episode(
-    index: BagIndex, messages: dict, latencies: dict, start: int, limit: int, views: list[int]
+    index: BagIndex,
+    messages: dict[str, dict[int, Any]],
+    latencies: dict[int, dict[str, float]],
+    start: int,
+    limit: int,
+    views: list[int],
 ) -> EpisodeRecord:
     """The episode whose views have stamps in [start, limit)."""
 

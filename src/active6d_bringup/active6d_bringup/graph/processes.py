@@ -66,7 +66,7 @@ class ProcessGraph:
         )
         self.executor.add_node(self._node)
         self._guests: list[Node] = []
-        self.processes: dict[str, subprocess.Popen] = {}
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.restarted: list[str] = []
         self._started = False
         self._pulses = Pulses(self._node)
@@ -198,7 +198,7 @@ class ProcessGraph:
                 raise ProcessError(f"{name} could not start; see its own message above")
 
 
-def _end(processes: list[subprocess.Popen], seconds: float) -> None:
+def _end(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
     for process in processes:
         process.send_signal(signal.SIGINT)
     deadline = time.monotonic() + seconds

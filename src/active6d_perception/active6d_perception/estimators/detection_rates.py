@@ -1,6 +1,7 @@
 """Detection rates of an estimator over many views, as BOP defines them, with confidence intervals."""
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.stats import mannwhitneyu, spearmanr
@@ -19,7 +20,7 @@ _RESAMPLES = 2000
 CALIBRATION_BINS = 10
 
 
-def bootstrapped(hits: np.ndarray, counts: np.ndarray, groups: Sequence) -> dict[str, float | int | None]:
+def bootstrapped(hits: np.ndarray, counts: np.ndarray, groups: Sequence[Any]) -> dict[str, float | int | None]:
     """The rate ``hits / counts`` with its 95 % bootstrap interval.
 
     Whole scenes are resampled, because views of one scene show the same objects. With a single scene, views are.

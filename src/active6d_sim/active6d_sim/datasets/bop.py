@@ -231,7 +231,7 @@ def _read_truth(folder: Path, image_ids: tuple[int, ...]) -> tuple[ImageTruth, .
     return tuple(truth)
 
 
-def _entries(by_image: dict[int, Any], path: Path, image: int) -> list:
+def _entries(by_image: dict[int, Any], path: Path, image: int) -> list[Any]:
     entries = by_image.get(image)
     if not isinstance(entries, list):
         raise ValueError(f"{path}: image {image}: no list of objects")

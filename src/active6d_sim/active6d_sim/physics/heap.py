@@ -209,7 +209,7 @@ def _add_walls(client: BulletClient, bin: Bin, bottom: float, top: float) -> lis
     return walls
 
 
-def _add_box(client: BulletClient, centre: tuple, half_extents: tuple) -> int:
+def _add_box(client: BulletClient, centre: tuple[float, float, float], half_extents: tuple[float, float, float]) -> int:
     shape = client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half_extents)
     body = client.createMultiBody(0, shape, basePosition=centre)
     client.changeDynamics(body, -1, **_CONTACT)

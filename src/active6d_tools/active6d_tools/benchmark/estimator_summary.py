@@ -38,7 +38,7 @@ SURE = 0.5
 SAME_ROTATION = 30.0
 
 
-def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence) -> dict[str, Any]:
+def summarise(model: ObjectModel, result: EstimatorResult, scenes: Sequence[Any]) -> dict[str, Any]:
     """All results of one estimator, for JSON.
 
     Args:
@@ -97,7 +97,7 @@ def headline(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _detection(result: EstimatorResult, scenes: Sequence, feature_seen: float | None = None) -> dict[str, Any]:
+def _detection(result: EstimatorResult, scenes: Sequence[Any], feature_seen: float | None = None) -> dict[str, Any]:
     """Detection rates by ADD and ADD-S; only of objects with a visible named part if ``feature_seen`` is given."""
     per_view = np.repeat(np.arange(len(result.views)), [len(view.visible_fraction) for view in result.views])
     visible = result.gather("visible_fraction")

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -134,7 +134,7 @@ def _train_variants(
     length: int,
     starts: "np.ndarray",
     seed: int,
-) -> list[dict]:
+) -> list[dict[str, Any]]:
     from active6d_agent.evaluation.ablations import ablate_training, training_variants
 
     variants = training_variants(part.value, steps, length, seed)
@@ -155,14 +155,14 @@ def _evaluate_variants(
     starts: "np.ndarray",
     steps: int,
     seed: int,
-    parameters: dict[str, dict],
-) -> list[dict]:
+    parameters: dict[str, dict[str, Any]],
+) -> list[dict[str, Any]]:
     """The ablations without training."""
     from active6d_agent.evaluation.ablations import PLANNING, STEPS, ablate_fusion, ablate_planning, ablate_steps
     from active6d_agent.evaluation.noise_resampling import ablate_noise_resampling
 
     test, common = lookups["test"], {"seed": seed}
-    rows: Iterator[dict]
+    rows: Iterator[dict[str, Any]]
     if part in (Part.FUSION, Part.VERIFICATION):
         rows = ablate_fusion(test.bank, names[0], starts, steps, scores=part is Part.VERIFICATION, **common)
         return collect_rows(rows, 3, f"fusing the views of {names[0]}")
@@ -199,7 +199,7 @@ def _train_seeds(
     return {key: training.best for key, training in trainings.items()}
 
 
-def _print(rows: list[dict], title: str) -> None:
+def _print(rows: list[dict[str, Any]], title: str) -> None:
     hidden = ("against_first", "parameter", "value", "policy", "training_seed", "noise")
     columns = [key for key in rows[0] if "_ci95" not in key and key not in hidden]
     cells = [[f"{row[key]:.3f}" if isinstance(row[key], float) else str(row[key]) for key in columns] for row in rows]

@@ -2,7 +2,7 @@
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -132,7 +132,7 @@ def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str
         raise ValueError(f"{mesh} cannot be added: {error}") from error
 
 
-def _describe(model: "ObjectModel") -> dict:
+def _describe(model: "ObjectModel") -> dict[str, Any]:
     symmetry = "about an axis" if model.symmetry.axis is not None else "none"
     if len(model.symmetry.discrete) > 1:
         symmetry = f"{len(model.symmetry.discrete)} rotations" + (", about an axis" if symmetry != "none" else "")

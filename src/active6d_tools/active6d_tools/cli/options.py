@@ -104,7 +104,7 @@ def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
     return overrides
 
 
-def usable_policies(text: str, bank: "SceneBank", parameters: dict[str, dict]) -> list[str]:
+def usable_policies(text: str, bank: "SceneBank", parameters: dict[str, dict[str, Any]]) -> list[str]:
     """Names out of a comma-separated list; ``all`` leaves out, with a note, policies whose weights are missing.
 
     Raises:

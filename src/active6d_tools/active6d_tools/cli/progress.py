@@ -1,7 +1,7 @@
 """Progress of work that several subcommands do."""
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from active6d_tools.cli.terminal import console, progress_bar
 
@@ -24,7 +24,7 @@ def follow_training(training: "PolicyTraining", lookups: Sequence["BatchedFusion
     console.print(f"best weights: {training.best}", highlight=False, markup=False)
 
 
-def collect_rows(rows: Iterable[dict], total: int, title: str) -> list[dict]:
+def collect_rows(rows: Iterable[dict[str, Any]], total: int, title: str) -> list[dict[str, Any]]:
     """The rows of an ablation; a row with a ``budget`` of moves counts as that much work."""
     collected = []
     with progress_bar() as bar:

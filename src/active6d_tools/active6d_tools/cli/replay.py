@@ -1,6 +1,6 @@
 """``active6d replay``."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -110,7 +110,7 @@ def _print_comparison(result: "ReplayResult") -> None:
         console.print(f"  {name}: {text}", highlight=False, markup=False)
 
 
-def _summary(result: "ReplayResult") -> dict:
+def _summary(result: "ReplayResult") -> dict[str, Any]:
     return {
         "views": result.views,
         "seconds": result.seconds,

@@ -99,7 +99,7 @@ def _fit_score(model: "ObjectModel", weights: Path, seed: int) -> dict[str, floa
 
 def _train(
     model: "ObjectModel", shards: dict[str, list[Path]], folder: Path, options: "TrainingOptions", cores: int
-) -> tuple[Path, list]:
+) -> tuple[Path, list[dict[str, float]]]:
     """Path of the best weights, and the validation results."""
     import json
 

@@ -1,12 +1,14 @@
 """Figures of ablations: what was measured over what was varied."""
 
+from typing import Any
+
 from active6d_tools.report.line_plots import Panel
 
 _REPORTED = ("reported", "hypotheses per object")
 _TRADE_OFFS = ("metres_weight", "stop_below", "as shipped", "random")
 
 
-def ablation_panels(part: str, rows: list[dict]) -> list[Panel]:
+def ablation_panels(part: str, rows: list[dict[str, Any]]) -> list[Panel]:
     """Detection rate, ADD and a third measure over what ``part`` varies; around them the interval over scenes.
 
     Args:
@@ -23,10 +25,10 @@ def ablation_panels(part: str, rows: list[dict]) -> list[Panel]:
         "steps": ("variant", "budget", "T"),
         "seeds": ("policy", "training_seed", "seed of the training"),
         "noise-resampling": ("noise", "policy", "views chosen by"),
-    }.get(part, (None, "variant", part))
+    }.get(part, ("", "variant", part))
     panels = []
     for key, label in (("detection_rate", "detection rate"), ("e_add_mm", "ADD [mm]"), third):
-        lines: dict[str, tuple] = {}
+        lines: dict[str, tuple[Any, ...]] = {}
         for name in dict.fromkeys(row.get(line, label) for row in rows):
             own = [row for row in rows if row.get(line, label) == name]
             interval = list(zip(*(row[f"{key}_ci95_scenes"] for row in own), strict=True))
@@ -36,7 +38,7 @@ def ablation_panels(part: str, rows: list[dict]) -> list[Panel]:
     return panels
 
 
-def _trade_offs(rows: list[dict]) -> list[Panel]:
+def _trade_offs(rows: list[dict[str, Any]]) -> list[Panel]:
     """Detection rate and ADD over travelled distance, and detection rate over moves."""
     panels = []
     for x, x_label, y, y_label, names in (

@@ -1,6 +1,7 @@
 """Numbers of a recorded episode: detection and errors if the bag has ground truth, distances, times."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -101,7 +102,7 @@ class EpisodeAnalysis:
         """An object is detected below this ADD."""
         return 1e3 * DETECTION_FRACTION * self.model.diameter
 
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, Any]:
         """The numbers for JSON."""
         truth = self.record.ground_truth
         return {

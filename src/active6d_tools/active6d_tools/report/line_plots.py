@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Panel:
 
     x_label: str
     y_label: str
-    lines: dict[str, tuple]
+    lines: dict[str, tuple[Any, ...]]
     logarithmic: bool = False
     levels: dict[str, float] = field(default_factory=dict)
     """Horizontal lines to compare with, by label."""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -82,7 +83,7 @@ class _StepPictures:
         return cls(step, outlines, data_uri(step.record.view.color), data_uri(depth[::2, ::2]), depth_range)
 
     @property
-    def objects(self) -> list[tuple]:
+    def objects(self) -> list[tuple[Any, ...]]:
         return list(zip(self.step.rows, self.outlines.objects, strict=True))
 
     @property
@@ -131,7 +132,7 @@ def _hypothesis_scale(steps: list[StepAnalysis]) -> ScoreScale:
     return ScoreScale.around(np.concatenate([np.zeros(0), *known]))
 
 
-def _path_scene(analysis: EpisodeAnalysis, scale: ScoreScale) -> dict:
+def _path_scene(analysis: EpisodeAnalysis, scale: ScoreScale) -> dict[str, Any]:
     """Data of the 3D drawing of the path, in metres, as plain numbers for JSON."""
     last = analysis.steps[-1]
     return {

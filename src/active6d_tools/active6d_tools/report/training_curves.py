@@ -1,11 +1,12 @@
 """The curve of a policy's training as a picture."""
 
 from pathlib import Path
+from typing import Any
 
 from active6d_tools.report.line_plots import Panel, draw_panels
 
 
-def draw_training(path: Path, title: str, rows: list[dict]) -> None:
+def draw_training(path: Path, title: str, rows: list[dict[str, Any]]) -> None:
     """Draw validation results and the loss or return over minutes of training.
 
     Raises:

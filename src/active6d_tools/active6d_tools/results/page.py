@@ -105,7 +105,7 @@ def fill(page: str, measured: Mapping[str, Measured]) -> str:
         ValueError: an unknown block.
     """
 
-    def renew(match: re.Match) -> str:
+    def renew(match: re.Match[str]) -> str:
         if match[2] not in BLOCKS:
             raise ValueError(f"docs/results.md has a block '{match[2]}'; known are {', '.join(BLOCKS)}")
         return f"{match[1]}\n{BLOCKS[match[2]](measured)}\n{match[3]}"

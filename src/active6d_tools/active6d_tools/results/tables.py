@@ -154,7 +154,7 @@ def noise_resampling_table(reports: Reports) -> str:
     return _pivot(reports, lambda row: f"`{row['policy']}`, {row['noise']} noise", render)
 
 
-def _pivot(reports: Reports, key: Callable[[dict], str], render: Callable[[dict], str]) -> str:
+def _pivot(reports: Reports, key: Callable[[dict[str, Any]], str], render: Callable[[dict[str, Any]], str]) -> str:
     columns = [{key(row): render(row) for row in report["rows"]} for report in reports.values()]
     names = list(dict.fromkeys(name for column in columns for name in column))
     return table(["", *reports], ([name, *(column.get(name, "") for column in columns)] for name in names))

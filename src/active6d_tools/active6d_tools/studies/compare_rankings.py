@@ -4,6 +4,8 @@
 Example: python -m active6d_tools.studies.compare_rankings mug --views 6 --walks 2
 """
 
+from typing import Any
+
 import numpy as np
 from rich.console import Console
 from rich.progress import track
@@ -28,7 +30,7 @@ def main() -> None:
     arguments = parser.parse_args()
     model, sphere = load_object(arguments.object), ViewSphere()
     estimator, verifier = create_estimator("auto", model), Verifier(model)
-    results: dict[str, list] = {ranking: [] for ranking in RANKINGS}
+    results: dict[str, list[Any]] = {ranking: [] for ranking in RANKINGS}
     for index in track(range(SPLITS["val"])):
         scene = load_scene(model.name, "val", index)
         simulator, rng = Simulator(scene, seed=index), np.random.default_rng(index)

@@ -51,7 +51,7 @@ def directions(count: int, rng: np.random.Generator) -> np.ndarray:
 def main() -> None:
     model, trained, samples = read_arguments(__doc__, every=2)
     estimator, views, rng = DenseEstimator(model, trained), model_views(model), np.random.default_rng(0)
-    errors: dict[str, list] = {name: [] for name in VARIANTS}
+    errors: dict[str, list[np.ndarray]] = {name: [] for name in VARIANTS}
     seconds = dict.fromkeys(VARIANTS, 0.0)
     for sample in track(samples):
         depth, camera = pool_depth(sample.view.depth, OUTPUT_STRIDE), output_camera(sample.view.camera)

@@ -6,6 +6,7 @@ with a JSON file of the configuration beside it; loading them executes no code.
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -102,7 +103,7 @@ class AttentionNetwork(nn.Module):
         return self.mean(self.policy(state)), weight, index
 
 
-def save_network(network: AttentionNetwork, path: Path, provenance: dict | None = None) -> None:
+def save_network(network: AttentionNetwork, path: Path, provenance: dict[str, Any] | None = None) -> None:
     """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
     config = {"steps": network.steps, "hidden": network.hidden, "rule": network.attention.rule}
     save_weights(network, path, "attention", config, provenance)

@@ -99,7 +99,7 @@ class BankVecEnv(VecEnv):
         """Remember the actions."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict]]:
+    def step_wait(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Move all cameras."""
         observation, reward, done, _, info = self.environment.step(self._actions)
         self._returns += reward
@@ -306,7 +306,7 @@ def validate(network: AttentionNetwork, lookup: BatchedFusion, steps: int) -> tu
     return measure(lookup, starts[:, 0], views).means
 
 
-def _checkpoint(ppo: PPO, folder: Path, state: dict) -> None:
+def _checkpoint(ppo: PPO, folder: Path, state: dict[str, Any]) -> None:
     """Weights and Adam's moments as tensors, the rest as JSON: nothing pickled."""
     tensors = {f"policy.{name}": value for name, value in ppo.policy.state_dict().items()}
     for index, moments in ppo.policy.optimizer.state_dict()["state"].items():
@@ -318,7 +318,7 @@ def _checkpoint(ppo: PPO, folder: Path, state: dict) -> None:
     write_file(folder / "latest.json", json.dumps({**state, "steps": ppo.num_timesteps}, indent=2) + "\n")
 
 
-def _restore(ppo: PPO, folder: Path, identity: dict) -> tuple[tuple[float, float], float]:
+def _restore(ppo: PPO, folder: Path, identity: dict[str, Any]) -> tuple[tuple[float, float], float]:
     """Load a checkpoint into ``ppo``; the best so far and the seconds spent."""
     path = folder / "latest.safetensors"
     try:

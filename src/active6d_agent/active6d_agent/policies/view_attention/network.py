@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -152,7 +152,9 @@ class ViewAttention(nn.Module):
         return _Seen(e, total, whole, attention, mask)
 
 
-def save_network(network: ViewAttention, path: Path, object_name: str, provenance: dict | None = None) -> None:
+def save_network(
+    network: ViewAttention, path: Path, object_name: str, provenance: dict[str, Any] | None = None
+) -> None:
     """Write ``path`` (.safetensors) and its configuration beside it (.json)."""
     config = {"object": object_name, "hidden": network.hidden, "weighing": asdict(network.weighing)}
     save_weights(network, path, "view-attention", config, provenance)
@@ -165,7 +167,7 @@ def load_network(path: Path, object_name: str) -> ViewAttention:
         ValueError: a file is missing, damaged, of another object or does not fit; the message names it.
     """
 
-    def build(config: dict) -> ViewAttention:
+    def build(config: dict[str, Any]) -> ViewAttention:
         if config["object"] != object_name:
             raise ValueError(f"these are weights for '{config['object']}', not for '{object_name}'")
         return ViewAttention(config["hidden"], Weighing(**config["weighing"]))

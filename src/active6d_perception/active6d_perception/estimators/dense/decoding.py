@@ -133,7 +133,7 @@ def axis_rotation_probability(T_camera_axis: np.ndarray, direction: np.ndarray) 
 
 
 def _poses_from_axes(
-    parts: dict, table: np.ndarray, used: np.ndarray, votes: np.ndarray, R_camera_ray: np.ndarray
+    parts: dict[str, np.ndarray], table: np.ndarray, used: np.ndarray, votes: np.ndarray, R_camera_ray: np.ndarray
 ) -> np.ndarray:
     """(n, 4, 4) poses from robust means of the votes for centre and axis; the rotation about the axis is arbitrary."""
     centre = _robust_mean(votes[table], used * np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))[table], 0.01)

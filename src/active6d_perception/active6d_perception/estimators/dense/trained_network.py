@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -43,7 +44,7 @@ class TrainedNetwork:
     object_name: str
     diameter: float
     size: NetworkSize
-    training: dict = field(default_factory=dict)
+    training: dict[str, Any] = field(default_factory=dict)
     score: ScoreModel | None = None
 
 
@@ -108,7 +109,7 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
     return TrainedNetwork(network.eval(), canonical_frame, model.name, model.diameter, size, training, score)
 
 
-def _read_description(path: Path, model: ObjectModel) -> dict:
+def _read_description(path: Path, model: ObjectModel) -> dict[str, Any]:
     described = path.with_suffix(".json")
     missing = [file for file in (path, described) if not file.is_file()]
     if missing:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ _SHARDS_TOGETHER = 24
 _WINDOW = (160, 208)
 
 
-class TrainingViews(IterableDataset):
+class TrainingViews(IterableDataset[Any]):
     """Augmented pairs of input and targets in random order, without end."""
 
     def __init__(

@@ -32,6 +32,7 @@ from active6d_perception.estimators.dense.trained_network import TrainedNetwork,
 from active6d_perception.estimators.dense.training.batches import TrainingViews, batches
 from active6d_perception.estimators.dense.training.curves import draw_curves
 from active6d_perception.estimators.dense.training.losses import LossWeights, loss_terms, total
+from active6d_perception.estimators.dense.training.targets import Targets
 from active6d_perception.estimators.dense.training.validation import validate
 
 _CLIP = 1.0  # norm of the gradient
@@ -184,7 +185,7 @@ class _Run:
             self._load()
         self._schedule = LambdaLR(self._optimizer, partial(_learning_rate_share, options), last_epoch=self.step - 1)
 
-    def advance(self, inputs: Tensor, targets: list) -> dict[str, float]:
+    def advance(self, inputs: Tensor, targets: list[Targets]) -> dict[str, float]:
         """Do one step of the optimiser; returns the terms of the loss."""
         inputs = inputs.to(self._device, memory_format=torch.channels_last)
         with torch.autocast(self._device.type, torch.bfloat16, enabled=has_fast_bfloat16(self._device.type)):
