@@ -14,7 +14,7 @@ from synthetic_bank import synthetic_bank
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.environment.gym_environment import Active6DEnv, Active6DVectorEnv
-from active6d_agent.environment.registration import ENVIRONMENT_ID
+from active6d_agent.environment.gym_registration import ENVIRONMENT_ID
 from active6d_agent.environment.throughput import measure_steps_per_second
 from active6d_agent.policies.registry import MAX_OBJECTS
 from active6d_core.camera import DEFAULT_CAMERA

@@ -484,9 +484,9 @@ def test_training_and_deployment_move_alike(lookup, network, policy):
 @pytest.mark.slow
 def test_it_learns_its_way_past_random_and_resumes(tmp_path):
     lookup = BatchedFusion(synthetic_bank("mug", scenes=3, objects=12))
-    starts = all_starts(lookup, 100, 0)
+    starts = all_starts(lookup, 40, 0)
     random = run_named(lookup, "random", starts, 4)
-    settings = {"episodes": 10, "updates": 60, "longest": 4, "steps": 4, "starts": 100, "batch": 48}
+    settings = {"episodes": 10, "updates": 60, "longest": 4, "steps": 4, "starts": 40, "batch": 48}
     parameters = dagger.DaggerParameters(rounds=4, evaluate_every=2, **settings)
     curve = list(dagger.train_dagger(lookup, lookup, tmp_path, parameters, Weighing(metres_weight=0.05)))
     assert [progress.round for progress in curve] == [2, 4]

@@ -9,9 +9,9 @@ import pytest
 from simulated_driver import look
 
 from active6d_bringup.camera import preflight
-from active6d_bringup.camera.decoding import decode_color, decode_depth
+from active6d_bringup.camera.depth_registration import register_depth
+from active6d_bringup.camera.driver_images import decode_color, decode_depth
 from active6d_bringup.camera.rectification import Rectifier
-from active6d_bringup.camera.registration import register_depth
 from active6d_bringup.camera.stream import SECOND, ArrivalGate, FrameMatcher, GateLimits, PoseHistory, Verdict
 from active6d_core.calibration import Calibration
 from active6d_core.camera import PinholeCamera, backproject

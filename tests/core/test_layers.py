@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,7 +32,7 @@ TRAINING = {
     "active6d_agent.policies.sb3",
 }
 #: Registers the environment where Gymnasium is installed, and must import where it is not.
-REGISTRATION = "active6d_agent.environment.registration"
+REGISTRATION = "active6d_agent.environment.gym_registration"
 MOST_LINES_OF_A_NODE, MOST_LINES_OF_A_FUNCTION = 300, 60
 #: Folders of the conversion and node layers.
 ROS_FOLDERS = {"ros", "nodes"}
@@ -159,6 +160,13 @@ def test_nodes_and_functions_are_short():
         lengths = {f"{module}.{f.name}": (f.end_lineno or 0) - f.lineno + 1 for f in functions}
         long += [name for name, length in lengths.items() if length > MOST_LINES_OF_A_FUNCTION]
     assert not long
+
+
+def test_a_name_of_a_module_says_which_one():
+    """Networks and registries are named alike in every package, and a command like what it runs."""
+    paths = [path for package in MAY_IMPORT for _, path in modules_of(package) if path.parent.name != "cli"]
+    names = Counter(path.stem for path in paths if path.stem != "__init__") - Counter(network=3, registry=2)
+    assert {name for name, count in names.items() if count > 1} == set()
 
 
 def test_lists_of_modules_are_current():

@@ -18,7 +18,7 @@ from active6d_core.se3 import make_transform
 from active6d_tools.report.analysis import analyse
 from active6d_tools.report.drawing import ScoreScale, depth_to_color
 from active6d_tools.report.figure import render_png
-from active6d_tools.report.page import render_html
+from active6d_tools.report.html_page import render_html
 from active6d_tools.report.silhouette import SilhouetteDrawer
 
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7 * 7 }}'

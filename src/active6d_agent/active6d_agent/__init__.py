@@ -3,6 +3,6 @@
 Importing this package registers the environment ``Active6D-v0`` where Gymnasium is installed.
 """
 
-from active6d_agent.environment.registration import register_environment
+from active6d_agent.environment.gym_registration import register_environment
 
 register_environment()

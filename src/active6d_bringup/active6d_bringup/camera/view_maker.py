@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from active6d_bringup.camera.decoding import decode_color, decode_depth
+from active6d_bringup.camera.depth_registration import register_depth
+from active6d_bringup.camera.driver_images import decode_color, decode_depth
 from active6d_bringup.camera.preflight import check_depth_unit, check_matrices, check_pose, check_sizes
 from active6d_bringup.camera.rectification import Rectifier
-from active6d_bringup.camera.registration import register_depth
 from active6d_core.calibration import Calibration
 from active6d_core.camera import View
 

@@ -1,12 +1,15 @@
 """The interface of simulated sensors, and their registry by name."""
 
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.registry import Registry
-from active6d_sim.rendering.renderer import RenderedView
+
+# The renderer loads Open3D, which takes a second; names of sensors are in the help of most commands.
+if TYPE_CHECKING:
+    from active6d_sim.rendering.renderer import RenderedView
 
 #: The sensor that active6d was developed with.
 DEFAULT_SENSOR = "active_stereo"
@@ -16,7 +19,7 @@ class Sensor(Protocol):
     """Turns a perfect view into a measured one."""
 
     def measure(
-        self, rendered: RenderedView, camera: PinholeCamera, rng: np.random.Generator
+        self, rendered: "RenderedView", camera: PinholeCamera, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 3) uint8 colour, and (H, W) float32 depth in metres with NaN for missing returns."""
         ...

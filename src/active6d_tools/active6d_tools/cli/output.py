@@ -74,7 +74,7 @@ def write_reports(
         OSError: a file cannot be written.
     """
     from active6d_tools.report.figure import render_png
-    from active6d_tools.report.page import render_html
+    from active6d_tools.report.html_page import render_html
     from active6d_tools.report.qualitative import render_qualitative
 
     for path, render in ((html, render_html), (png, render_png), (figure, render_qualitative)):
