@@ -1,4 +1,4 @@
-"""The reliability battery: seeded attacks on stamps, messages, bags and views, as many as the time allows.
+"""The reliability battery: seeded attacks on stamps, messages, bags, views and files, as many as the time allows.
 
     python tests/battery.py --seconds 1200 --seed 0
 
@@ -7,6 +7,7 @@ Each row of the table is one kind of attack with the number of trials and of fai
 
 import argparse
 import shutil
+import subprocess
 import sys
 import time
 import traceback
@@ -142,7 +143,23 @@ def views() -> Iterator[Trial]:
     yield trial
 
 
-ATTACKS = {"stamps": stamps, "messages": messages, "bags": bags, "views": views}
+def files() -> Iterator[Trial]:
+    """Hostile files: read or refused within twenty seconds, with less than 2 GB, and without a traceback."""
+    command = [sys.executable, str(ROOT / "hostile_files.py")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdin is not None and reader.stdout is not None  # noqa: PT018
+        reader.stdout.readline()
+
+        def trial(rng: np.random.Generator) -> str:
+            reader.stdin.write(f"{rng.integers(2**62)}\n")
+            reader.stdin.flush()
+            return reader.stdout.readline().strip()
+
+        yield trial
+        reader.stdin.close()
+
+
+ATTACKS = {"stamps": stamps, "messages": messages, "bags": bags, "views": views, "files": files}
 
 
 def run(attack: Callable[[], Iterator[Trial]], seconds: float, seed: int) -> tuple[int, list[str]]:

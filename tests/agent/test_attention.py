@@ -252,7 +252,7 @@ def test_training_learns_what_is_rewarded(lookup, tmp_path):
         (
             "weights.json",
             lambda path: path.write_text('{"policy": "attention", "steps": 9, "hidden": 128, "rule": "learned"}'),
-            "state_dict",
+            r"'policy.0.weight' has shape \(128, 30\), expected",
         ),
     ],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from synthetic_bank import observe_synthetic, synthetic_bank, synthetic_scene
 
+from active6d_agent.bank import scene_bank
 from active6d_agent.bank.scene_bank import BankScene, build_bank, load_bank, observe_scene, view_entropy
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses
@@ -170,3 +171,22 @@ def test_what_is_no_bank_is_refused_with_its_name(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(ValueError, match=r"bank\.npz: not a scene bank"):
         load_bank(path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"hypothesis_count": lambda values: values + 10**9},
+        {"object_count": lambda values: values - 1},
+        {"pair_count": lambda values: -values},
+        {"object_count": lambda values: values.astype(float)},
+    ],
+)
+def test_rows_that_do_not_add_up_are_refused_before_tables_are_made(tmp_path, changes, monkeypatch):
+    synthetic_bank("coffee_cup", scenes=3, objects=4).save(tmp_path / "good.npz")
+    with np.load(tmp_path / "good.npz") as stored:
+        data = dict(stored)
+    np.savez(tmp_path / "bank.npz", **{name: changes.get(name, np.asarray)(value) for name, value in data.items()})
+    monkeypatch.setattr(scene_bank, "_read_scene", lambda *_: pytest.fail("tables were made"))
+    with pytest.raises(ValueError, match=r"not a scene bank \(\w+_count"):
+        load_bank(tmp_path / "bank.npz")

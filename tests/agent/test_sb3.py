@@ -13,6 +13,7 @@ from active6d_agent.environment.gym_environment import Active6DEnv
 from active6d_agent.evaluation.policy_evaluation import run_named
 from active6d_agent.policies.registry import create_policy
 from active6d_agent.policies.sb3 import export_model
+from active6d_core.object_model import load_object
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +62,11 @@ def test_stable_baselines_own_file_is_not_loaded(lookup, tmp_path):
     )
     with pytest.raises(ValueError, match=r"write them with active6d_agent\.policies\.sb3\.export_model"):
         create_policy("sb3", lookup.model, weights=str(tmp_path / "mine.zip"))
+
+
+def test_a_network_that_would_fill_the_memory_is_refused(tmp_path):
+    (tmp_path / "a.safetensors").write_bytes(bytes(16))
+    config = {"policy": "sb3", "algorithm": "PPO", "steps": 5, "net_arch": [10**6, 10**6], "activation": "Tanh"}
+    (tmp_path / "a.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match="net_arch needs at most"):
+        create_policy("sb3", load_object("mug"), weights=str(tmp_path / "a.safetensors"))

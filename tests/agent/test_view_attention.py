@@ -549,7 +549,7 @@ def test_a_decision_is_fast(policy, lookup):
         (
             "weights.json",
             lambda path: path.write_text(json.dumps({**json.loads(path.read_text()), "hidden": 9})),
-            "state_dict",
+            r"'attend.weight' has shape",
         ),
         (
             "weights.json",

@@ -127,6 +127,59 @@ def test_object_list_and_show_as_json(tmp_path):
     assert all(0.1 < part.mean() < 0.6 for part in np.split(red, 4, axis=1))
 
 
+def test_one_bad_description_does_not_end_the_listing(tmp_path, monkeypatch):
+    (tmp_path / "bad.yaml").write_text("a: &x [1]\nb: [*x, *x]\n")
+    (tmp_path / "worse.yaml").write_bytes(b"\xff\xfe\x00")
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path))
+    result = run("object", "list", "--json", str(tmp_path / "list.json"))
+    assert result.exit_code == 0
+    listed = json.loads((tmp_path / "list.json").read_text())
+    assert {"bunny", "coffee_cup", "mug"} <= {item["name"] for item in listed["objects"]}
+    assert listed["left_out"].keys() == {"bad", "worse"}
+    assert "left out: bad" in result.stderr
+
+
+def test_one_bad_module_does_not_end_the_listing(tmp_path, monkeypatch):
+    (tmp_path / "broken_module.py").write_text("raise RuntimeError('no')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("ACTIVE6D_IMPORT", "broken_module,missing_module")
+    result = run("list", "--json", str(tmp_path / "list.json"))
+    assert result.exit_code == 0
+    assert "dense" in json.loads((tmp_path / "list.json").read_text())["estimator"]
+    assert [line.split(":")[0] for line in result.stderr.splitlines()].count("left out") == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("hypothesis_fusion.epsilom=0.01", "has no parameter 'epsilom', did you mean 'epsilon'?"),
+        ("hypothesis_fusion.epsilon=abc", "must be a float such as 0.01, got 'abc'"),
+        ("hypothesis_fusion.epsilon=", "the value is empty"),
+        ("hypothesis_fuson.epsilon=0.01", "did you mean 'hypothesis_fusion'?"),
+        ("hypothesis_fusion.epsilon=[[[", "the value is not YAML"),
+    ],
+)
+def test_a_wrong_parameter_is_one_line_with_the_nearest_name(override, words):
+    result = run("episode", "--object", "mug", "--set", override)
+    assert result.exit_code == 2
+    assert words in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("hypothesis_fusion:\n  ros__parameters: {epsilom: 0.1}\n", "did you mean 'epsilon'?"),
+        ("- 1\n", "it must hold NODE"),
+        ("a: &x {}\nb: *x\n", "alias"),
+    ],
+)
+def test_a_wrong_parameter_file_is_one_line(tmp_path, text, words):
+    (tmp_path / "params.yaml").write_text(text)
+    result = run("episode", "--object", "mug", "--params-file", str(tmp_path / "params.yaml"))
+    assert result.exit_code == 2
+    assert words in " ".join(result.stderr.split())
+
+
 def test_an_added_object_is_found_and_measured(tmp_path, monkeypatch):
     mesh = tmp_path / "brick.stl"
     trimesh.creation.box((30.0, 40.0, 120.0)).export(mesh)

@@ -6,6 +6,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+#: Formats that are read. Pillow knows others, some of which run other programs.
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
+#: Pixels of an image, before any of them is decoded.
+_MOST_PIXELS = 50_000_000
 #: Bits of grey images that 16-bit files carry: cameras fill the low bits.
 _GREY_BITS = (8, 10, 12, 14, 16)
 _SIXTEEN_BIT = {"I;16", "I;16L", "I;16B", "I;16N", "I"}
@@ -49,7 +53,9 @@ def read_depth(source: Path | bytes) -> np.ndarray:
 
 def _open(source: Path | bytes) -> Image.Image:
     try:
-        image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
+        image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=_FORMATS)
+        if image.width * image.height > _MOST_PIXELS:
+            raise ValueError(f"{image.width}x{image.height} pixels are too many")
         image.load()
     except FileNotFoundError as error:
         raise ValueError(f"{_name(source)}: no such file") from error

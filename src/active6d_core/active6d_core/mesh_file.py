@@ -1,30 +1,40 @@
 """Triangle meshes as users bring them: loaded, repaired where that is safe, else refused with the likely cause."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from active6d_core.mesh_limits import check_counts, read_limited
+
 #: Diameters in metres that an object in a bin can have; others are of another unit.
 PLAUSIBLE_DIAMETER = (0.002, 2.0)
+#: Faces of a mesh that is repaired; the repair takes seconds each time that a mesh is loaded.
+_MOST_REPAIRED = 100_000
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres": 1.0}
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh:
     """One mesh of a file's triangles, in the file's frame and unit.
 
+    Materials and textures are not read, nor any other file that this one names.
+
     Raises:
-        ValueError: no file, no triangles, or vertices that are not finite.
+        ValueError: no file, not within the limits of :mod:`active6d_core.mesh_limits`, damaged, no triangles, or
+            vertices that are not finite.
     """
-    if not path.is_file():
-        raise ValueError(f"mesh {path} does not exist")
+    content = read_limited(path)
     try:
-        mesh = trimesh.load_mesh(path)
+        # Trimesh would look for other files beside a file that it knows by its path.
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load_mesh(io.BytesIO(content), file_type=path.suffix[1:].lower(), skip_materials=True)
     # Readers of meshes raise many kinds of errors on damaged files.
     except Exception as error:
         raise ValueError(f"mesh {path.name} cannot be read ({error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise ValueError(f"mesh {path.name} has no faces; a point cloud has no surface")
+    check_counts(path.name, len(mesh.vertices), len(mesh.faces))
     if not np.isfinite(mesh.vertices).all():
         raise ValueError(f"mesh {path.name} has vertices that are not finite")
     mesh.remove_unreferenced_vertices()
@@ -44,6 +54,11 @@ def close_mesh(mesh: trimesh.Trimesh) -> list[str]:
     """
     done = []
     faces = len(mesh.faces)
+    if faces > _MOST_REPAIRED and not (mesh.is_watertight and _has_inside(mesh)):
+        raise ValueError(
+            f"mesh is open, or its faces do not agree on what is outside; with {faces} faces it is too large to be "
+            "repaired here: do it in a mesh editor, such as MeshLab"
+        )
     closed = mesh.copy()
     if not mesh.is_watertight and trimesh.repair.fill_holes(closed):
         mesh.vertices, mesh.faces = closed.vertices, closed.faces

@@ -12,16 +12,22 @@ from typing import Any
 
 import numpy as np
 import trimesh
-import yaml
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from active6d_core.mesh_file import check_diameter, close_mesh, load_mesh
+from active6d_core.nearest_name import did_you_mean
+from active6d_core.structured_text import read_yaml
 
 SHIPPED_OBJECTS = Path(__file__).parent / "objects"
 _REQUIRED = {"name", "instances", "color"}
 _OPTIONAL = {"mesh", "profile", "scale", "symmetry", "features", "source"}
 _LARGEST_GROUP = 120
+#: If set, a description may name a mesh outside of its own folder.
+ALLOW_OUTSIDE_VARIABLE = "ACTIVE6D_ALLOW_OUTSIDE"
+_MOST_INSTANCES, _MOST_PROFILE_ROWS, _MOST_FEATURES = 200, 1000, 100
+# Cells along the longest side, for the search of the two vertices that are farthest apart.
+_DIAMETER_CELLS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +128,7 @@ class ObjectModel:
 
 def list_objects() -> list[str]:
     """Names of all objects that :func:`load_object` finds."""
-    return sorted({path.stem for folder in search_folders() for path in folder.glob("*.yaml")})
+    return sorted({path.stem for folder in search_folders() for path in folder.glob("*.yaml") if path.is_file()})
 
 
 @lru_cache(maxsize=16)
@@ -134,11 +140,17 @@ def load_object(name: str) -> ObjectModel:
     """
     for folder in search_folders():
         path = folder / f"{name}.yaml"
-        if path.is_file():
+        # A name can come from a bag or a scene: it must not lead to another folder.
+        if path.name == f"{name}.yaml" and path.is_file():
             return read_description(path)
-    raise ValueError(f"unknown object '{name}'; known: {', '.join(list_objects())} (ACTIVE6D_OBJECT_PATH adds folders)")
+    known = list_objects()
+    raise ValueError(
+        f"unknown object '{name}'{did_you_mean(name, known)}; known: {', '.join(known)} (ACTIVE6D_OBJECT_PATH adds "
+        "folders)"
+    )
 
 
+@np.errstate(all="ignore")
 def read_description(path: Path) -> ObjectModel:
     """Read one description file and the mesh that it names.
 
@@ -146,36 +158,56 @@ def read_description(path: Path) -> ObjectModel:
         ValueError: the description or the mesh is wrong; the message names the file and the key.
     """
     try:
-        description = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(description, dict):
-        raise ValueError(f"{path}: not a mapping of keys")
-    missing, unknown = _REQUIRED - description.keys(), description.keys() - _REQUIRED - _OPTIONAL
-    if missing or unknown:
-        raise ValueError(f"{path}: missing keys {sorted(missing)}, unknown keys {sorted(unknown)}")
-    if description["name"] != path.stem:
-        raise ValueError(f"{path}: name '{description['name']}' differs from the file's")
-    try:
+        description = read_yaml(path)
+        _check_keys(description, path)
         mesh, origin = _load_mesh(description, path)
-        low, high = (int(count) for count in description["instances"])
-        color = np.array(description["color"], float)
-        if not (1 <= low <= high) or color.shape != (3,):
-            raise ValueError("instances needs [fewest, most] from 1, color needs [r, g, b]")
+        diameter = _diameter(mesh)
+        check_diameter(diameter, float(description.get("scale", 1.0)))
         return ObjectModel(
             name=path.stem,
             mesh=mesh,
-            diameter=_diameter(mesh),
+            diameter=diameter,
             symmetry=_read_symmetry(description.get("symmetry") or {}),
-            instances=(low, high),
-            color=color,
-            features={
-                key: np.array(box, float).reshape(2, 3) for key, box in (description.get("features") or {}).items()
-            },
+            instances=_read_instances(description["instances"]),
+            color=_read_color(description["color"]),
+            features=_read_features(description.get("features") or {}),
             origin=origin,
         )
-    except (TypeError, KeyError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: {error}") from error
+    # A wrong value fails in whichever library meets it first.
+    except Exception as error:
+        raise ValueError(f"{path}: {error or type(error).__name__}") from error
+
+
+def _check_keys(description: Any, path: Path) -> None:
+    if not isinstance(description, dict):
+        raise ValueError("not a mapping of keys")
+    missing, unknown = _REQUIRED - description.keys(), {*map(str, description)} - _REQUIRED - _OPTIONAL
+    if missing or unknown:
+        hints = "".join(did_you_mean(key, _REQUIRED | _OPTIONAL) for key in sorted(unknown)[:1])
+        raise ValueError(f"missing keys {sorted(missing)}, unknown keys {sorted(unknown)}{hints}")
+    if description["name"] != path.stem:
+        raise ValueError(f"name '{description['name']}' differs from the file's")
+
+
+def _read_instances(value: Any) -> tuple[int, int]:
+    low, high = (int(count) for count in value)
+    if not 1 <= low <= high <= _MOST_INSTANCES:
+        raise ValueError(f"instances needs [fewest, most] from 1 to {_MOST_INSTANCES}")
+    return low, high
+
+
+def _read_color(value: Any) -> np.ndarray:
+    color = np.array(value, float)
+    if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
+        raise ValueError("color needs [r, g, b] from 0 to 1")
+    return color
+
+
+def _read_features(value: Any) -> dict[str, np.ndarray]:
+    boxes = {str(key): np.array(box, float).reshape(2, 3) for key, box in value.items()}
+    if len(boxes) > _MOST_FEATURES or not all(np.isfinite(box).all() for box in boxes.values()):
+        raise ValueError(f"features must be at most {_MOST_FEATURES} boxes of finite numbers")
+    return boxes
 
 
 def search_folders() -> list[Path]:
@@ -198,14 +230,18 @@ def _load_mesh(description: dict[str, Any], path: Path) -> tuple[trimesh.Trimesh
     if ("mesh" in description) == ("profile" in description):
         raise ValueError("needs either mesh (a file) or profile (rows of radius and height)")
     if "profile" in description:
-        mesh = trimesh.creation.revolve(np.array(description["profile"], float), sections=96)
+        profile = np.array(description["profile"], float)
+        if profile.ndim != 2 or profile.shape[1] != 2 or not 2 <= len(profile) <= _MOST_PROFILE_ROWS:
+            raise ValueError(f"profile needs 2 to {_MOST_PROFILE_ROWS} rows of radius and height")
+        if not np.isfinite(profile).all() or (profile[:, 0] < 0).any():
+            raise ValueError("profile needs finite numbers and radii that are not negative")
+        mesh = trimesh.creation.revolve(profile, sections=96)
     else:
-        mesh = load_mesh(path.parent / description["mesh"])
+        mesh = load_mesh(_mesh_path(description["mesh"], path))
     scale = float(description.get("scale", 1.0))
     if not 0 < scale < np.inf:
         raise ValueError(f"scale must be positive, got {scale}")
     mesh.apply_scale(scale)  # type: ignore[no-untyped-call]
-    check_diameter(_diameter(mesh), scale)
     close_mesh(mesh)
     # With the origin at the centre of mass, physics needs no inertial offset, and ADD depends less on rotation errors.
     origin = np.array(mesh.center_mass)
@@ -213,8 +249,41 @@ def _load_mesh(description: dict[str, Any], path: Path) -> tuple[trimesh.Trimesh
     return mesh, origin
 
 
+def _mesh_path(name: Any, path: Path) -> Path:
+    """Path of the mesh that the description at ``path`` names."""
+    mesh, folder = path.parent / str(name), path.parent.resolve()
+    if not os.environ.get(ALLOW_OUTSIDE_VARIABLE) and not mesh.resolve().is_relative_to(folder):
+        raise ValueError(
+            f"mesh {name} is outside of the description's folder; move it there, or allow it with "
+            f"'active6d --allow-outside COMMAND' or {ALLOW_OUTSIDE_VARIABLE}=1"
+        )
+    return mesh
+
+
 def _diameter(mesh: trimesh.Trimesh) -> float:
-    return float(pdist(np.asarray(mesh.convex_hull.vertices)).max())
+    """Largest distance between two vertices, exactly, with memory that grows linearly.
+
+    Vertices of the convex hull are grouped in cells. Pairs of cells are compared in the order of the largest distance
+    that they allow, until no pair can hold a larger distance than the largest so far.
+    """
+    points = np.asarray(mesh.convex_hull.vertices)
+    low = points.min(axis=0)
+    edge = max(float(np.ptp(points, axis=0).max()), np.finfo(float).tiny) / _DIAMETER_CELLS
+    x, y, z = ((points - low) / edge).astype(int).T
+    number = (x * (_DIAMETER_CELLS + 1) + y) * (_DIAMETER_CELLS + 1) + z
+    order = np.argsort(number, kind="stable")
+    starts = np.unique(number[order], return_index=True)[1]
+    cells = np.split(points[order], starts[1:])
+    lows = np.minimum.reduceat(points[order], starts)
+    highs = np.maximum.reduceat(points[order], starts)
+    first, second = np.triu_indices(len(cells))
+    farthest = np.linalg.norm(np.maximum(highs[first] - lows[second], highs[second] - lows[first]), axis=1)
+    largest = 0.0
+    for pair in np.argsort(-farthest):
+        if farthest[pair] <= largest:
+            break
+        largest = max(largest, float(cdist(cells[first[pair]], cells[second[pair]]).max()))
+    return largest
 
 
 def _read_symmetry(description: dict[str, Any]) -> Symmetry:
@@ -224,10 +293,12 @@ def _read_symmetry(description: dict[str, Any]) -> Symmetry:
     axis = description.get("axis")
     if axis is not None:
         axis = np.array(axis, float)
-        if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
+        if axis.shape != (3,) or not 0 < np.linalg.norm(axis) < np.inf:
             raise ValueError("symmetry.axis needs three numbers, not all zero")
         axis = axis / np.linalg.norm(axis)
     rotation_vectors = np.array(description.get("discrete_rotvec_degrees") or np.zeros((0, 3)), float).reshape(-1, 3)
+    if len(rotation_vectors) > _LARGEST_GROUP or not np.isfinite(rotation_vectors).all():
+        raise ValueError(f"symmetry.discrete_rotvec_degrees needs at most {_LARGEST_GROUP} rows of finite numbers")
     return Symmetry(axis, _generate_group(Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix()))
 
 

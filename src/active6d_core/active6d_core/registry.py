@@ -15,6 +15,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
+from active6d_core.nearest_name import did_you_mean
 from active6d_core.object_model import ObjectModel
 
 #: The name that stands for whatever is best for the object at hand.
@@ -99,7 +100,8 @@ class Registry(Generic[_Part]):
         unknown = sorted(parameters.keys() - set(accepted))
         if unknown:
             known = ", ".join(accepted) if accepted else "none"
-            raise ValueError(f"{self._kind} '{name}' has no parameter '{unknown[0]}'; it has: {known}")
+            hint = did_you_mean(unknown[0], accepted)
+            raise ValueError(f"{self._kind} '{name}' has no parameter '{unknown[0]}'{hint}; it has: {known}")
         try:
             return factory(model, **parameters)
         except (TypeError, ValueError) as error:
@@ -116,7 +118,8 @@ class Registry(Generic[_Part]):
         if name not in self._factories and name in self._entry_points:
             self._load(self._entry_points[name])
         if name not in self._factories:
-            raise ValueError(f"unknown {self._kind} '{name}'; known: {', '.join([AUTOMATIC, *self.names()])}")
+            known = [AUTOMATIC, *self.names()]
+            raise ValueError(f"unknown {self._kind} '{name}'{did_you_mean(name, known)}; known: {', '.join(known)}")
         return self._factories[name]
 
     def _load(self, entry_point: EntryPoint) -> None:
@@ -179,8 +182,22 @@ def import_extensions() -> None:
         if module not in sys.modules:
             try:
                 import_module(module)
-            except ImportError as error:
+            except Exception as error:  # a stranger's module raises what it likes
                 raise ValueError(f"module {module} (--import or {IMPORT_VARIABLE}): {error}") from error
+
+
+def leave_out_broken_imports() -> list[str]:
+    """Import what ``ACTIVE6D_IMPORT`` names, and take modules that fail out of it; returns why, one text for each."""
+    wanted, failures = _requested_modules(), []
+    for module in wanted.copy():
+        os.environ[IMPORT_VARIABLE] = module
+        try:
+            import_extensions()
+        except ValueError as error:
+            wanted.remove(module)
+            failures.append(str(error))
+    os.environ[IMPORT_VARIABLE] = ",".join(wanted)
+    return failures
 
 
 def _requested_modules() -> list[str]:

@@ -6,6 +6,8 @@ import numpy as np
 
 from active6d_core.se3 import look_at
 
+_MOST_VIEWS = 100_000
+
 
 @dataclass(frozen=True)
 class ViewSphere:
@@ -19,7 +21,7 @@ class ViewSphere:
         azimuths: number of evenly spaced azimuths, the first at world +x.
 
     Raises:
-        ValueError: a radius or number that is not positive, or an elevation outside [0, 90].
+        ValueError: a radius or number that is not positive, too many views, or an elevation outside [0, 90].
     """
 
     radius: float = 0.8
@@ -31,6 +33,8 @@ class ViewSphere:
     def __post_init__(self) -> None:
         if not 0 < self.radius < np.inf or self.azimuths < 1 or not self.elevations_degrees:
             raise ValueError(f"view sphere: radius and number of views must be positive, got {self}")
+        if self.azimuths * len(self.elevations_degrees) > _MOST_VIEWS:
+            raise ValueError(f"view sphere: a grid has at most {_MOST_VIEWS} views")
         if not all(0 <= elevation <= 90 for elevation in self.elevations_degrees):
             raise ValueError(f"view sphere: elevations must be within [0, 90], got {self.elevations_degrees}")
         elevation, azimuth = np.meshgrid(

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,11 +11,13 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
+from active6d_core.array_archive import read_array
 from active6d_core.camera import View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.images import read_color, read_depth
 from active6d_core.object_model import ObjectModel
 from active6d_core.rgbd import make_view
+from active6d_core.structured_text import read_json
 from active6d_perception.active6d import Active6D
 from active6d_sim.datasets.bop import BopScene
 from active6d_tools.report.drawing import ScoreScale
@@ -179,15 +180,14 @@ def _read_array(path: Path, read_image_file: Callable[[Path], np.ndarray]) -> np
     if path.suffix != ".npy":
         return read_image_file(path)
     try:
-        return np.load(path, allow_pickle=False)
-    # NumPy raises many kinds of errors on damaged files.
-    except Exception as error:
+        return read_array(path)
+    except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not a readable array ({error})") from error
 
 
 def _read_matrix(path: Path) -> np.ndarray:
     try:
-        content = json.loads(path.read_text())
+        content = read_json(path)
         return np.reshape(np.array(content["K" if "K" in content else "cam_K"], float), (3, 3))
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{path}: needs 'K' or 'cam_K' with 9 numbers ({error})") from error

@@ -19,12 +19,14 @@ from typing import Any
 
 import numpy as np
 
+from active6d_core.array_archive import read_archive
 from active6d_core.camera import View
 from active6d_core.files import atomic_file, cache_folder
 from active6d_core.interrupts import worker_pool
 from active6d_core.metrics import MISSED_E_ADD, e_add
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
+from active6d_core.structured_text import parse_json
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import Estimator
 from active6d_perception.scene.observed_surface import SurfaceGrid
@@ -32,6 +34,7 @@ from active6d_perception.scene.verification import Verifier
 
 FORMAT = 2
 SHIPPED_BANKS = Path(__file__).parent / "shipped"
+_MOST_PAIRS = 50_000_000
 _HYPOTHESIS_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw", "verification", "score", "x0", "y0", "x1", "y1", "depth")
 
 
@@ -294,18 +297,37 @@ def load_bank(path: Path) -> SceneBank:
         ValueError: the file is missing, damaged, of another format or not a bank; the message names it.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            data = dict(stored)
-        header = json.loads(str(data["header"]))
+        data = read_archive(path)
+        header = parse_json(str(data["header"]))
         if header["format"] != FORMAT:
             raise ValueError(f"format {header['format']}, this version reads {FORMAT}")
         sphere = ViewSphere(header["radius"], tuple(header["elevations_degrees"]), header["azimuths"])
         surface = header["surface"]
         grid = SurfaceGrid(**{**surface, "width": tuple(surface["width"])})
+        _check_counts(data, len(header["scenes"]), len(sphere))
         scenes = [_read_scene(data, index, name) for index, name in enumerate(header["scenes"])]
         return SceneBank(header["object"], sphere, grid, scenes, header["provenance"])
-    except Exception as error:  # numpy raises many kinds on damaged archives
+    except Exception as error:  # a wrong value fails in whichever library meets it first
         raise ValueError(f"{path}: not a scene bank ({error}); make it again with 'active6d bank'") from error
+
+
+def _check_counts(data: dict[str, np.ndarray], scenes: int, views: int) -> None:
+    """Check the numbers of rows of each scene against the tables, before tables of that size are made.
+
+    Raises:
+        ValueError: they do not add up, or a scene is too large.
+    """
+    rows = {"object_count": "T_world_object", "hypothesis_count": "table", "pair_count": "pair_error"}
+    for count, table in rows.items():
+        shape = (scenes, views) if count == "hypothesis_count" else (scenes,)
+        if data[count].shape != shape or data[count].dtype.kind != "i" or (data[count] < 0).any():
+            raise ValueError(f"{count} must be {shape} numbers from 0")
+        # As Python's integers, which do not overflow.
+        if sum(data[count].ravel().tolist()) != len(data[table]):
+            raise ValueError(f"{count} does not add up to the {len(data[table])} rows of {table}")
+    largest = (data["object_count"] * data["hypothesis_count"].sum(axis=1)).max(initial=0)
+    if largest > _MOST_PAIRS:
+        raise ValueError(f"a scene has {largest} pairs of hypotheses and objects, at most {_MOST_PAIRS} are read")
 
 
 def _read_scene(data: dict[str, np.ndarray], index: int, name: str) -> BankScene:

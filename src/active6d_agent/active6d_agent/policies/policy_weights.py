@@ -5,10 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import nn
 
 from active6d_core.files import atomic_file, write_file
+from active6d_core.structured_text import read_json
+from active6d_perception.tensor_file import load_module
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
@@ -23,13 +25,16 @@ def save_weights(
     write_file(path.with_suffix(".json"), json.dumps(document, indent=2) + "\n")
 
 
-def load_weights(path: Path, policy: str, build: Callable[[dict[str, Any]], _Module], remedy: str = "") -> _Module:
+def load_weights(
+    path: Path, policy: str, build: Callable[[dict[str, Any]], _Module], remedy: str = "", *, dry_run: bool = True
+) -> _Module:
     """Read what :func:`save_weights` wrote.
 
     Args:
         path: of the ``.safetensors``.
         policy: whose weights they must be.
         build: configuration to a module of that shape; may raise any exception.
+        dry_run: whether the module can be made without memory, to compare shapes first; else ``build`` bounds its size.
         remedy: how such weights are made; by default the command that trains the policy.
 
     Raises:
@@ -39,12 +44,11 @@ def load_weights(path: Path, policy: str, build: Callable[[dict[str, Any]], _Mod
     if not path.is_file():
         raise ValueError(f"{path}: no weights of the {policy} policy here; {remedy}")
     try:
-        config = json.loads(path.with_suffix(".json").read_text())
+        config = read_json(path.with_suffix(".json"))
         if config["policy"] != policy:
             raise ValueError(f"these are weights of policy '{config['policy']}'")
-        module = build(config)
-        module.load_state_dict(load_file(path))
-    except Exception as error:  # safetensors and torch raise their own kinds
+        module = load_module(path, lambda: build(config), dry_run=dry_run)
+    except Exception as error:  # a wrong configuration fails in whichever library meets it first
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: no weights of the {policy} policy ({reason}); {remedy}") from error
     return module.eval()

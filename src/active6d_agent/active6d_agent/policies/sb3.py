@@ -23,6 +23,7 @@ from active6d_core.object_model import ObjectModel
 
 _ALGORITHMS = {algorithm.__name__: algorithm for algorithm in (A2C, PPO, SAC, TD3)}
 _ACTIVATIONS = {activation.__name__: activation for activation in (nn.ELU, nn.LeakyReLU, nn.ReLU, nn.Tanh)}
+_MOST_LAYERS, _WIDEST = 8, 4096
 _REMEDY = "write them with active6d_agent.policies.sb3.export_model"
 
 
@@ -53,6 +54,10 @@ def export_model(model: BaseAlgorithm, path: Path) -> None:
 
 
 def _build(config: dict[str, Any]) -> BasePolicy:
+    architecture = config["net_arch"] or []
+    for layers in architecture.values() if isinstance(architecture, dict) else [architecture]:
+        if len(layers) > _MOST_LAYERS or not all(1 <= width <= _WIDEST for width in layers):
+            raise ValueError(f"net_arch needs at most {_MOST_LAYERS} layers of 1 to {_WIDEST}")
     return _ALGORITHMS[config["algorithm"]].policy_aliases["MultiInputPolicy"](
         *make_spaces(config["steps"]),
         lambda _: 0.0,
@@ -74,7 +79,7 @@ class Sb3Policy(DeterministicPolicy):
     """
 
     def __init__(self, model: ObjectModel, weights: str) -> None:
-        self._policy = load_weights(Path(weights), "sb3", _build, _REMEDY)
+        self._policy = load_weights(Path(weights), "sb3", _build, _REMEDY, dry_run=False)
         self._steps = horizon(self._policy.observation_space)
 
     def decide(self, observation: Observation) -> Decision:

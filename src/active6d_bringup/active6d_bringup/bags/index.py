@@ -1,13 +1,11 @@
 """A bag read once: serialized messages by topic and stamp, whatever the bag's namespace. Needs no ROS."""
 
-import json
 import zlib
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rosbags.rosbag2 import Reader
 
 from active6d_bringup.bags.camera_topics import CameraOptions
@@ -27,6 +25,7 @@ from active6d_core.ros.topics import (
     DIAGNOSTICS,
     TOPICS,
 )
+from active6d_core.structured_text import parse_json, read_yaml
 
 _POSE_ENDING = f"/{CAMERA_POSE.name}"
 _ENDINGS = tuple("/" + topic.name.lstrip("/") for topic in CONTRACT)
@@ -191,10 +190,10 @@ def _read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
             raise BagError(f"{folder}: no metadata.yaml and no .mcap file; this is not a bag")
         return {}, ["there is no metadata.yaml, the recording was killed"]
     try:
-        metadata = yaml.safe_load(path.read_text())[INFORMATION]
+        metadata = read_yaml(path)[INFORMATION]
         if not isinstance(metadata, dict):
             raise TypeError
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         if not any(folder.glob("*.mcap")):
             raise BagError(f"{folder}: metadata.yaml is damaged, and there is no .mcap file") from error
         return {}, ["metadata.yaml is damaged"]
@@ -265,8 +264,8 @@ def topic_names(recorded: set[tuple[str, str]], folder: Path) -> dict[str, str] 
 def _parse_settings(text: str | None) -> dict[str, dict[str, Any]]:
     """Parameters of the nodes when recording; nothing where the bag does not have them."""
     try:
-        settings = json.loads(text or "{}")
-    except (TypeError, json.JSONDecodeError):
+        settings = parse_json(text or "{}")
+    except (TypeError, ValueError):
         return {}
     if not isinstance(settings, dict):
         return {}

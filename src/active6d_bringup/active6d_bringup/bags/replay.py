@@ -15,7 +15,13 @@ from active6d_bringup.bags.index import read_bag
 from active6d_bringup.bags.reader import read_episodes
 from active6d_bringup.bags.source import BagError
 from active6d_bringup.bags.writer import TYPESTORE, stamp_of
-from active6d_bringup.graph.composition import GraphDescription, OnEvent, default_params_file, running
+from active6d_bringup.graph.composition import (
+    GraphDescription,
+    OnEvent,
+    check_parameters,
+    default_params_file,
+    running,
+)
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
 from active6d_core.ros.conversions import read_table
 from active6d_core.ros.node import qos_of
@@ -181,6 +187,7 @@ def describe(
         "pose_estimator": estimator,
         "hypothesis_fusion": {**recorded.get("hypothesis_fusion", {}), "object": name},
     }
+    check_parameters(settings.overrides)
     nodes = {name: {**frames, **parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
     return GraphDescription(nodes, settings.params_file or default_params_file(), domain=settings.domain)
 

@@ -23,11 +23,13 @@ from active6d_bringup.graph.composition import (
     Graph,
     GraphDescription,
     OnEvent,
+    check_parameters,
     default_params_file,
     running,
 )
 from active6d_bringup.graph.composition import EpisodeInterrupted as EpisodeInterrupted
 from active6d_core.hypotheses import SceneObjects
+from active6d_core.nearest_name import did_you_mean
 from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
     MessageError,
@@ -208,7 +210,9 @@ def describe(settings: EpisodeSettings) -> GraphDescription:
         nodes["episode_recorder"] = {"bag": str(settings.bag)}
     unknown = settings.overrides.keys() - nodes.keys()
     if unknown:
-        raise ValueError(f"no node '{min(unknown)}' in an episode; there are {', '.join(nodes)}")
+        hint = did_you_mean(min(unknown), nodes)
+        raise ValueError(f"no node '{min(unknown)}' in an episode{hint}; there are {', '.join(nodes)}")
+    check_parameters(settings.overrides)
     nodes = {name: {**parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
     if settings.bag is not None:
         nodes["episode_recorder"]["settings"] = json.dumps(nodes)

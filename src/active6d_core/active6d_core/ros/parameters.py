@@ -5,12 +5,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.context import Context
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterUninitializedException,
+)
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
+
+from active6d_core.structured_text import parse_yaml
 
 _LARGEST_INTEGER = 2**63 - 1
 
@@ -106,7 +111,12 @@ class ParameterNode(LifecycleNode):
         limits = ParameterLimits(minimum, maximum, choices)
         try:
             self.declare_parameter(name, default)
-        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            self.get_parameter(name)  # fails where the value is empty
+        except (
+            InvalidParameterTypeException,
+            InvalidParameterValueException,
+            ParameterUninitializedException,
+        ) as error:
             expected = f"a {type(default).__name__} such as {default!r}"
             raise ValueError(f"{self.get_name()}: parameter '{name}' must be {expected} ({error})") from error
         if not limits.allow(self.value(name)):
@@ -128,8 +138,8 @@ class ParameterNode(LifecycleNode):
             ValueError: it holds something else; the message names the parameter.
         """
         try:
-            value = yaml.safe_load(self.value(name))
-        except yaml.YAMLError:
+            value = parse_yaml(self.value(name))
+        except ValueError:
             value = None
         if not isinstance(value, dict):
             raise ValueError(f"{self.get_name()}: parameter '{name}' must be a YAML mapping")

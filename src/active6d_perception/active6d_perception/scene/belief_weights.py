@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import save_file
 
 from active6d_core.files import atomic_file, write_file
 from active6d_core.object_model import find_beside
+from active6d_core.structured_text import read_json
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_perception.scene.scene_evidence import BODY_COLUMNS, ROTATION_COLUMNS
+from active6d_perception.tensor_file import read_tensors
 
 SHIPPED_BELIEFS = Path(__file__).parent / "weights"
 #: Stands for an object without weights of its own.
@@ -128,18 +129,18 @@ def load_belief(path: Path) -> BeliefWeights:
         ValueError: a file is missing, damaged or of another version; the message names it.
     """
     try:
-        document = json.loads(path.with_suffix(".json").read_text())
+        document = read_json(path.with_suffix(".json"))
         if document["format"] != _FORMAT:
             raise ValueError(f"format {document['format']}, this version reads {_FORMAT}")
         for name, columns in _COLUMNS.items():
             if document["columns"][name] != list(columns):
                 raise ValueError(f"'{name}' has other columns than this version")
         tensors: dict[str, dict[str, np.ndarray]] = {name: {} for name in _COLUMNS}
-        for key, value in load_file(path).items():
+        for key, value in read_tensors(path).items():
             name, _, part = key.partition(".")
             tensors[name][part] = value
         scorers = {name: Scorer(**parts) for name, parts in tensors.items()}
         return BeliefWeights(**scorers, provenance=document.get("provenance") or {})
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, SafetensorError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: no weights of fusion ({reason}); fit them with: active6d train fusion") from error

@@ -20,6 +20,7 @@ from PIL import Image
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.images import read_color, read_depth
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform, transform_from_quaternion
+from active6d_core.structured_text import read_json
 
 CAMERA_FILE, TRUTH_FILE, VISIBILITY_FILE = "scene_camera.json", "scene_gt.json", "scene_gt_info.json"
 #: Published datasets round rotations to about six digits; matrices farther from orthonormal are refused.
@@ -200,10 +201,10 @@ def _write_by_image(path: Path, entries: dict[int, Any]) -> None:
 def _read_by_image(path: Path) -> dict[int, Any]:
     """A file's entries by image number, ascending."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file; a BOP scene folder needs it") from error
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not a JSON file ({error})") from error
     if not isinstance(content, dict) or not all(key.isascii() and key.isdecimal() for key in content):
         raise ValueError(f"{path}: must map image numbers to entries")

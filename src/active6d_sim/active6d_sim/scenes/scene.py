@@ -5,9 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from active6d_core.array_archive import read_archive
+from active6d_core.bounds import FARTHEST
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import is_rigid
 from active6d_sim.scenes.surroundings import Surroundings
+
+_MOST_OBJECTS, _MOST_BYTES = 1000, 2**24
 
 
 @dataclass(frozen=True)
@@ -21,7 +25,7 @@ class Bin:
         wall_thickness: of walls and floor, metres.
 
     Raises:
-        ValueError: a size is not positive and finite.
+        ValueError: a size is not positive or too large.
     """
 
     inner_width: float
@@ -31,8 +35,8 @@ class Bin:
 
     def __post_init__(self) -> None:
         sizes = (self.inner_width, self.inner_depth, self.wall_thickness)
-        if not (np.isfinite(sizes).all() and min(sizes) > 0 and 0 <= self.wall_height < np.inf):
-            raise ValueError(f"bin sizes must be positive and finite, got {self}")
+        if not (np.isfinite(sizes).all() and min(sizes) > 0 and 0 <= self.wall_height <= FARTHEST >= max(sizes)):
+            raise ValueError(f"bin sizes must be positive and at most {FARTHEST:g} m, got {self}")
 
     @classmethod
     def for_model(cls, model: ObjectModel) -> "Bin":
@@ -72,6 +76,8 @@ class Scene:
         for poses in (self.T_world_object, self.T_world_hidden):
             if poses.ndim != 3 or not is_rigid(poses):
                 raise ValueError(f"scene {self.name}: poses must be rigid (n, 4, 4) transforms")
+            if len(poses) > _MOST_OBJECTS or np.abs(poses[:, :3, 3]).max(initial=0.0) > FARTHEST:
+                raise ValueError(f"scene {self.name}: more than {_MOST_OBJECTS} objects, or one {FARTHEST:g} m away")
         if self.visible_fraction.ndim != 2 or self.visible_fraction.shape[1] != len(self):
             shape = self.visible_fraction.shape
             raise ValueError(f"scene {self.name}: visible_fraction has shape {shape}, expected (M, {len(self)})")
@@ -107,17 +113,17 @@ class Scene:
             ValueError: the file is missing, damaged or not a scene; the message names it.
         """
         try:
-            with np.load(path, allow_pickle=False) as data:
-                around = {name.removeprefix("surroundings_"): data[name] for name in data if name.startswith("surr")}
-                return cls(
-                    str(data["object_name"]),
-                    str(data["name"]),
-                    int(data["seed"]),
-                    data["T_world_object"],
-                    Bin(*data["bin"].tolist()),
-                    data["visible_fraction"],
-                    data["T_world_hidden"],
-                    Surroundings.from_arrays(around) if around else None,
-                )
-        except Exception as error:  # NumPy raises many kinds of errors on damaged archives
+            data = read_archive(path, _MOST_BYTES)
+            around = {name.removeprefix("surroundings_"): data[name] for name in data if name.startswith("surr")}
+            return cls(
+                str(data["object_name"]),
+                str(data["name"]),
+                int(data["seed"]),
+                data["T_world_object"],
+                Bin(*data["bin"].reshape(4).tolist()),
+                data["visible_fraction"],
+                data["T_world_hidden"],
+                Surroundings.from_arrays(around) if around else None,
+            )
+        except Exception as error:  # a wrong value fails in whichever library meets it first
             raise ValueError(f"{path}: not a stored scene ({error})") from error

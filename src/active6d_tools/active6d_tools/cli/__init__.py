@@ -103,10 +103,15 @@ def show_help(
     ctx: typer.Context,
     network: Annotated[bool, typer.Option("--network", help="Let other machines reach the nodes.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    outside: Annotated[
+        bool, typer.Option("--allow-outside", help="Let object descriptions name meshes outside of their folder.")
+    ] = False,
 ) -> None:
     """Show the help if no command is given."""
     if debug:
         os.environ["ACTIVE6D_TRACEBACK"] = "1"
+    if outside:
+        os.environ["ACTIVE6D_ALLOW_OUTSIDE"] = "1"
     if not network:
         keep_on_this_machine()
     if ctx.invoked_subcommand is None:

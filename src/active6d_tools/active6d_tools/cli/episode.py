@@ -95,6 +95,7 @@ def _write_reports(bag: Path, report: Path | None, figure: Path | None) -> None:
 def _check_names(settings: "EpisodeSettings") -> None:
     """Refuse wrong names before any node starts; a node in its own process could report them only in its log."""
     from active6d_agent.policies.registry import list_policies
+    from active6d_core.nearest_name import did_you_mean
     from active6d_core.object_model import load_object
     from active6d_core.registry import AUTOMATIC
     from active6d_perception.estimators.registry import list_estimators
@@ -107,7 +108,7 @@ def _check_names(settings: "EpisodeSettings") -> None:
         ("--sensor", settings.sensor, [AUTOMATIC, *list_sensors()]),
     ):
         if value is not None and value not in known:
-            raise ValueError(f"{option} '{value}' is not among {', '.join(known)}")
+            raise ValueError(f"{option} '{value}' is not among {', '.join(known)}{did_you_mean(value, known)}")
 
 
 def _run(settings: "EpisodeSettings") -> "EpisodeResult":

@@ -28,7 +28,12 @@ def list_models(json_file: JsonFile = None) -> None:
     """
     from active6d_core.object_model import list_objects, load_object
 
-    rows = [_describe(load_object(name)) for name in list_objects()]
+    rows, refused = [], {}
+    for name in list_objects():
+        try:
+            rows.append(_describe(load_object(name)))
+        except ValueError as error:
+            refused[name] = str(error)
     cells = [
         (
             row["name"],
@@ -41,7 +46,9 @@ def list_models(json_file: JsonFile = None) -> None:
         for row in rows
     ]
     print_table(("name", "symmetry", "diameter", "instances", "triangles", "features"), cells, left=2)
-    write_json(json_file, {"objects": rows})
+    for name, reason in refused.items():
+        messages.print(f"left out: {name}: {reason}", highlight=False, markup=False)
+    write_json(json_file, {"objects": rows, "left_out": refused})
 
 
 @app.command()

@@ -89,7 +89,7 @@ def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
     Raises:
         ValueError: a text that is not of that form.
     """
-    import yaml
+    from active6d_core.structured_text import parse_yaml
 
     overrides: dict[str, dict[str, Any]] = {}
     for text in texts:
@@ -98,9 +98,11 @@ def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
         if not (equals and dot and node and parameter):
             raise ValueError(f"--set {text}: expected NODE.NAME=VALUE, such as hypothesis_fusion.epsilon=0.01")
         try:
-            overrides.setdefault(node, {})[parameter] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise ValueError(f"--set {text}: the value is not YAML ({error})") from error
+            overrides.setdefault(node, {})[parameter] = parse_yaml(value)
+        except ValueError as error:
+            raise ValueError(f"--set {text}: the value is {error}") from error
+        if overrides[node][parameter] is None:
+            raise ValueError(f"--set {text}: the value is empty; an empty text is {name}='\"\"'")
     return overrides
 
 

@@ -27,6 +27,8 @@ HEADS = {
 #: The heads that deployment decodes; the others only serve the comparison in ``docs/estimator.md``.
 DEPLOYED_HEADS = {name: channels for name, channels in HEADS.items() if not name.startswith("coordinates")}
 
+_WIDEST = 1024
+
 
 @dataclass(frozen=True)
 class NetworkSize:
@@ -36,9 +38,9 @@ class NetworkSize:
     last: int = 64
 
     def __post_init__(self) -> None:
-        if len(self.widths) != 4 or min(*self.widths, self.last) < 1:
+        if len(self.widths) != 4 or not all(1 <= width <= _WIDEST for width in (*self.widths, self.last)):
             raise ValueError(
-                f"a network needs four positive widths and a positive last width, got {self.widths}, {self.last}"
+                f"a network needs four widths and a last width from 1 to {_WIDEST}, got {self.widths}, {self.last}"
             )
 
 

@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from active6d_core.files import atomic_file, write_file
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import is_rigid
+from active6d_core.structured_text import read_json
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
 from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize
 from active6d_perception.estimators.dense.network_input import CHANNELS
 from active6d_perception.estimators.score_model import ScoreModel
+from active6d_perception.tensor_file import load_module
 
 _FORMAT = 1
 #: Regressors of the score: shares of the visible surface that fit, that are looked through, and that fit of what is not
@@ -94,13 +95,13 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
         if not is_rigid(canonical_frame.T_object_axis, 1e-5):
             raise ValueError("T_object_axis is not a rigid transform")
         heads = HEADS if description["heads"] == HEADS else DEPLOYED_HEADS
-        network = DenseNetwork(size, heads)
         score = ScoreModel.from_dict(description["score"], SCORE_FEATURES) if "score" in description else None
-    except (KeyError, TypeError, ValueError) as error:
+    # A wrong value fails in whichever library meets it first.
+    except Exception as error:
         raise ValueError(f"{path.with_suffix('.json')}: bad description of a network ({error})") from error
     try:
-        network.load_state_dict(load_file(path))
-    except (OSError, SafetensorError, RuntimeError) as error:
+        network = load_module(path, lambda: DenseNetwork(size, heads))
+    except (OSError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(
             f"{path}: damaged, or not the weights that its .json describes ({reason}); {_advice(model)}"
@@ -115,9 +116,9 @@ def _read_description(path: Path, model: ObjectModel) -> dict[str, Any]:
     if missing:
         raise ValueError(f"{missing[0]}: no such file of weights; {_advice(model)}")
     try:
-        description = json.loads(described.read_text())
+        description = read_json(described)
         made_for, diameter = description["object"], float(description["diameter"])
-    except (ValueError, TypeError, KeyError) as error:
+    except (ArithmeticError, ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{described}: damaged ({error}); {_advice(model)}") from error
     if made_for != model.name or abs(diameter - model.diameter) > 1e-3 * model.diameter:
         raise ValueError(

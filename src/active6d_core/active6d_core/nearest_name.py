@@ -1,0 +1,10 @@
+"""The known name that a mistyped one was probably meant to be."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``, did you mean 'epsilon'?`` for the nearest known name; empty if none is near."""
+    near = get_close_matches(str(name)[:100], list(known), n=1)
+    return f", did you mean '{near[0]}'?" if near else ""
