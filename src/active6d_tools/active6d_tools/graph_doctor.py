@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
-from active6d_core.ros.conversions import HARDWARE_ID, status_values
+from active6d_core.ros.conversions import own_statuses, status_values
 from active6d_core.ros.topics import CONTRACT
 from active6d_tools.machine_doctor import Check
 
@@ -92,9 +92,9 @@ class _Listener(Node):
         self.received[topic] += 1
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
+        for status in own_statuses(message):
             inside = status.name.startswith(self.get_namespace().rstrip("/") + "/")
-            if status.hardware_id == HARDWARE_ID and inside and "state" in status_values(status):
+            if inside and "state" in status_values(status):
                 self.heartbeats[status.name] = status
 
 

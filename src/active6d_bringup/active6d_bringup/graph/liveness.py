@@ -8,7 +8,7 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
-from active6d_core.ros.conversions import HARDWARE_ID
+from active6d_core.ros.conversions import own_statuses
 from active6d_core.ros.topics import DIAGNOSTICS
 
 #: A process that neither beats nor computes for this long hangs.
@@ -55,9 +55,8 @@ class Pulses:
         return now - self._last[name] > HUNG_SECONDS
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.hardware_id == HARDWARE_ID:
-                self._last[status.name.rsplit("/", 1)[-1]] = self._clock()
+        for status in own_statuses(message):
+            self._last[status.name.rsplit("/", 1)[-1]] = self._clock()
 
 
 def processor_seconds(process: int) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion, Vector3
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
@@ -519,17 +519,31 @@ def _read_box(table: np.ndarray) -> np.ndarray:
 # Diagnostics
 
 
+def make_status(
+    name: str, text: str, values: dict[str, str], level: bytes = DiagnosticStatus.OK, hardware_id: str = HARDWARE_ID
+) -> DiagnosticStatus:
+    """A diagnostic status with key-value pairs."""
+    status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=hardware_id)
+    status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+    return status
+
+
+def own_statuses(message: DiagnosticArray) -> list[DiagnosticStatus]:
+    """The statuses of this project's nodes; other programs publish on the same topic."""
+    return [status for status in message.status if status.hardware_id == HARDWARE_ID]
+
+
 def status_values(status: DiagnosticStatus) -> dict[str, str]:
     """The values of a diagnostic status by key."""
     return {pair.key: pair.value for pair in status.values}
 
 
 def latencies_from_diagnostics(message: DiagnosticArray) -> dict[str, float]:
-    """Milliseconds that this project's nodes worked on a view, by node name; others' statuses are ignored."""
+    """Milliseconds that this project's nodes worked on a view, by node name."""
     latencies = {}
-    for status in message.status:
+    for status in own_statuses(message):
         value = status_values(status).get("latency_ms", "")
-        if status.hardware_id == HARDWARE_ID and re.fullmatch(r"\d+(\.\d+)?", value):
+        if re.fullmatch(r"\d+(\.\d+)?", value):
             latencies[status.name.rsplit("/", 1)[-1]] = float(value)
     return latencies
 

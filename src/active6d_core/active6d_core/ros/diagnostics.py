@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.timer import Timer
 
-from active6d_core.ros.conversions import HARDWARE_ID, ns_to_stamp
+from active6d_core.ros.conversions import make_status, ns_to_stamp
 from active6d_core.ros.heartbeat import Awaited, Watch
 from active6d_core.ros.parameters import ParameterNode
 
@@ -127,10 +127,7 @@ class DiagnosticNode(ParameterNode):
     def _diagnose(self, level: bytes, message: str, stamp: int, values: dict[str, str]) -> None:
         values = {**values, "views": str(self._views_measured)}
         values |= {"rejected": str(self._rejected), "lost": str(self._lost)}
-        status = DiagnosticStatus(
-            level=level, name=self.get_fully_qualified_name(), message=message, hardware_id=HARDWARE_ID
-        )
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        status = make_status(self.get_fully_qualified_name(), message, values, level)
         report = DiagnosticArray(status=[status])
         report.header.stamp = ns_to_stamp(stamp)
         self._diagnostics.publish(report)

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from active6d_core.ros.conversions import HARDWARE_ID, MessageError, make_header, stamp_to_ns, status_values
+from active6d_core.ros.conversions import MessageError, make_header, make_status, stamp_to_ns, status_values
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class EpisodeStart:
     def to_message(self) -> DiagnosticArray:
         """The message to publish."""
         text = f"episode in {self.info['scene']}" if self.info.get("scene") else "episode"
-        return _to_message(self.stamp, self.frame, _status("episode", text, self.info, hardware_id=""))
+        return _to_message(self.stamp, self.frame, make_status("episode", text, self.info, hardware_id=""))
 
     @classmethod
     def from_message(cls, message: Any) -> "EpisodeStart":
@@ -57,7 +57,7 @@ class EpisodeEnd:
 
     def to_message(self) -> DiagnosticArray:
         """The message to publish."""
-        return _to_message(self.stamp, self.frame, _status("episode", self.reason, self.info))
+        return _to_message(self.stamp, self.frame, make_status("episode", self.reason, self.info))
 
     @classmethod
     def from_message(cls, message: Any) -> "EpisodeEnd":
@@ -99,7 +99,7 @@ class GoalStatus:
     def to_message(self) -> DiagnosticArray:
         """The message to publish; a refusal has the level WARN."""
         level = DiagnosticStatus.WARN if self.state is GoalState.REFUSED else DiagnosticStatus.OK
-        status = _status("view_goal", self.reason, {"state": self.state.value}, level)
+        status = make_status("view_goal", self.reason, {"state": self.state.value}, level)
         return _to_message(self.stamp, self.frame, status)
 
     @classmethod
@@ -117,14 +117,6 @@ class GoalStatus:
             raise MessageError(f"goal state is '{state}', expected one of {known}")
         stamp = stamp_to_ns(message.header.stamp)
         return cls(stamp, message.header.frame_id, GoalState(state), message.status[0].message)
-
-
-def _status(
-    name: str, text: str, values: dict[str, str], level: bytes = DiagnosticStatus.OK, hardware_id: str = HARDWARE_ID
-) -> DiagnosticStatus:
-    status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=hardware_id)
-    status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-    return status
 
 
 def _to_message(stamp: int, frame: str, status: DiagnosticStatus) -> DiagnosticArray:
