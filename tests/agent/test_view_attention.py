@@ -499,7 +499,8 @@ def test_it_learns_its_way_past_random_and_resumes(tmp_path):
     assert deployed.detection_rate.mean() > random.detection_rate.mean() + 0.03
     assert deployed.e_add_mm.mean() < random.e_add_mm.mean()
     assert deployed.distance_m.mean() <= random.distance_m.mean()
-    more = dagger.DaggerParameters(rounds=5, evaluate_every=2, **settings)
+    quick = settings | {"episodes": 2, "updates": 2, "starts": 4}
+    more = dagger.DaggerParameters(rounds=5, evaluate_every=2, **quick)
     assert [p.round for p in dagger.train_dagger(lookup, lookup, tmp_path, more, resume=True)] == [5]
     assert len((tmp_path / "curve.jsonl").read_text().splitlines()) == 3
     with pytest.raises(ValueError, match="no weights of the view-attention policy"):
@@ -507,7 +508,7 @@ def test_it_learns_its_way_past_random_and_resumes(tmp_path):
 
 
 def test_the_weighing_is_the_best_that_is_not_longer_than_random(lookup, network):
-    starts = all_starts(lookup, 30, 0)
+    starts = all_starts(lookup, 15, 0)
     given = network.weighing
     chosen = dagger.choose_weighing(network, lookup, starts, 4)
     assert network.weighing == given
