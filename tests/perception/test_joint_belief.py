@@ -17,7 +17,7 @@ from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform, transform_points
-from active6d_perception.model.visible_samples import VisibleSamples, visible_samples
+from active6d_perception.model.visible_samples import VisibleSamples
 from active6d_perception.scene import measured_cases as cases
 from active6d_perception.scene.ambiguity import ambiguity_of
 from active6d_perception.scene.belief_training import LabelledPlaces, fit_belief, fit_probability
@@ -103,9 +103,9 @@ def test_a_handle_fits_where_it_is_and_is_looked_through_elsewhere(render):
     segmentation = np.isfinite(depth).astype(np.uint16)
     hypotheses = Hypotheses.from_masks(T[None], np.ones(1), np.ones(1), segmentation, floor)
     view = measure_view(floor, CAMERA, np.eye(4), hypotheses, ambiguity)
-    handle = visible_samples(ambiguity.views, ambiguity.telling, 64, mug.mesh.area)
-    counted = cases.count_cases(T[None], ambiguity.rotations, ambiguity.middle, 0.03, handle, view)
-    counted = counted.reshape(-1, cases.WHAT, cases.WHOSE)
+    counted = cases.count_cases(
+        T[None], ambiguity.rotations, ambiguity.middle, 0.03, ambiguity.telling_samples, view
+    ).reshape(-1, cases.WHAT, cases.WHOSE)
     fitting, through = counted[:, cases.FITTING, 0], counted[:, cases.LOOKED_THROUGH, 2]
     assert fitting.argmax() == 0
     assert fitting[0] > 5 * fitting[9:27].max()

@@ -40,6 +40,7 @@ class Ambiguity:
         rotations: (r, 4, 4) ``T_object_rotated`` about the axis of near symmetry, the identity first and alone without
             such an axis.
         telling: (s,) bool, which samples of ``views`` tell the rotations apart.
+        telling_twins: (s,) bool, which of the others tell the twins apart.
         middle: (3,) middle of the body, which rotations leave in place; object frame, metres.
         diameter: of the object, metres.
     """
@@ -53,6 +54,10 @@ class Ambiguity:
             self.rotations = near.rotations_about_axis(np.arange(_ROTATIONS) * 2 * np.pi / _ROTATIONS)
             tells = telling_surface(model, self.rotations[1:], self.views.points, self.views.normals)
             self.telling = tells.mean(axis=0) > _TELLING
+        self.telling_twins = np.zeros(len(self.telling), bool)
+        if len(self.twins) > 1:
+            tells = telling_surface(model, self.twins[1:], self.views.points, self.views.normals)
+            self.telling_twins = tells.any(axis=0) & ~self.telling
         body = self.views.points[~self.telling].astype(float)
         # Averaged over the rotations: the body's samples are not spread exactly evenly about the axis.
         self.middle = transform_points(self.rotations, 0.5 * (body.min(axis=0) + body.max(axis=0))[None]).mean(
@@ -103,6 +108,16 @@ class Ambiguity:
     def body_samples(self) -> VisibleSamples:
         """Of the surface that does not tell rotations apart."""
         return visible_samples(self.views, ~self.telling, _BODY_SAMPLES, self.model.mesh.area)
+
+    @cached_property
+    def telling_samples(self) -> VisibleSamples:
+        """Of the surface that tells rotations apart."""
+        return visible_samples(self.views, self.telling, _TELLING_SAMPLES, self.model.mesh.area)
+
+    @cached_property
+    def twin_samples(self) -> VisibleSamples:
+        """Of the surface that tells twins apart."""
+        return visible_samples(self.views, self.telling_twins, _TELLING_SAMPLES, self.model.mesh.area)
 
     @cached_property
     def all_samples(self) -> VisibleSamples:
