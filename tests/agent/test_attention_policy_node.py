@@ -117,6 +117,15 @@ def test_an_episode_of_two_moves(episode):
     assert played.errors() == []
 
 
+def test_a_policy_that_starts_within_an_episode_without_its_first_views_ends_it(episode):
+    played = episode()
+    played.start(SECOND)
+    played.view(40, 5 * SECOND)
+    played.graph.spin_until(lambda: len(played.ends) == 1)
+    assert played.ends[0].status[0].message.startswith("attention_policy was started again")
+    assert len(played.goals) == 0
+
+
 def test_the_seed_decides(make_objects):
     paths = []
     for seed in (3, 3, 4):

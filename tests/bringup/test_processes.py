@@ -95,12 +95,42 @@ def test_killed_recorder_and_hung_estimator_come_back(graphs, tmp_path, victim, 
     assert len(list((tmp_path / "bag").glob("*.mcap"))) == (2 if victim == "episode_recorder" else 1)
 
 
+@pytest.mark.slow
+def test_killed_policy_comes_back_and_the_episode_ends_as_ever(graphs, tmp_path):
+    events = []
+    result = run_episode(settings(tmp_path / "bag"), killer(graphs, "attention_policy", 2), events.append)
+    assert "attention_policy died (SIGKILL), starting it again" in events
+    record = read_episode(tmp_path / "bag")
+    assert record.end_reason == result.reason == "budget of 3 moves spent"
+    composed = run_episode(settings(processes=False))
+    for lived, recorded, expected in zip(result.steps, record.steps, composed.steps, strict=True):
+        assert lived.stamp == recorded.stamp == expected.stamp
+        np.testing.assert_array_equal(lived.T_world_camera, expected.T_world_camera)
+        np.testing.assert_array_equal(recorded.objects.T_world_object, expected.objects.T_world_object)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "seconds"), [(signal.SIGKILL, 3.0), (signal.SIGSTOP, 10.0)])
+def test_a_camera_that_dies_or_hangs_ends_the_episode_within_seconds(graphs, tmp_path, number, seconds):
+    struck = []
+
+    def strike(step):
+        if step.index == 1:
+            os.kill(graphs[0].processes["camera_simulator"].pid, number)
+            struck.append(time.monotonic())
+
+    with pytest.raises(ProcessError, match=r"camera_simulator ended \(SIGKILL\)"):
+        run_episode(settings(tmp_path / "bag", steps=500), strike)
+    assert time.monotonic() - struck[0] < seconds + 5.0, "five seconds are for the end of the other processes"
+    assert len(read_episode(tmp_path / "bag").steps) >= 2
+
+
 def test_node_that_cannot_be_replaced_is_named(graphs):
-    graph = processes_module.ProcessGraph(GraphDescription({"attention_policy": {}}, domain=fresh_domain()))
+    graph = processes_module.ProcessGraph(GraphDescription({"camera_simulator": {}}, domain=fresh_domain()))
     with running(graph):
         graph.start()
-        graph.processes["attention_policy"].kill()
-        with pytest.raises(ProcessError, match=r"attention_policy ended \(SIGKILL\)"):
+        graph.processes["camera_simulator"].kill()
+        with pytest.raises(ProcessError, match=r"camera_simulator ended \(SIGKILL\)"):
             spin(graph)
 
 

@@ -173,10 +173,14 @@ class AttentionPolicyNode(GraphNode):
         return self._latest is not None and stamp == self._latest[0]
 
     def _on_view(self, stamp: int, view: dict[str, Any]) -> None:
+        unknown = self._episode is None and self._views.began_before(stamp)
         episode = self._episode or self._begin_episode(stamp)
         self._latest = (stamp, view["objects"], view["unexplained"])
         episode.add_view(stamp, view["pose"][:3, 3])
         self._published = []
+        if unknown:
+            # How many moves are left cannot be known.
+            self._finish(episode, stamp, "attention_policy was started again, and earlier views are no longer kept")
         if not episode.ended:
             with self.measure(stamp) as summary:
                 self._decide(episode, *self._latest)

@@ -34,12 +34,13 @@ NODES = {
     "episode_recorder": NodeEntry(
         "active6d_bringup.nodes.episode_recorder", "EpisodeRecorderNode", ("bag",), restarted=True
     ),
+    # These three get their inputs back when they start again: they are transient local.
     "attention_policy": NodeEntry(
         "active6d_agent.nodes.attention_policy",
         "AttentionPolicyNode",
         ("object", "policy", "seed", "steps", "metres"),
+        restarted=True,
     ),
-    # These two get their inputs back when they start again: they are transient local.
     "hypothesis_fusion": NodeEntry(
         "active6d_perception.nodes.hypothesis_fusion",
         "HypothesisFusionNode",

@@ -138,6 +138,13 @@ class ViewInputs:
         """Whether a view has begun to come after the last complete one."""
         return not self._views.missing().keys() <= self._left
 
+    def began_before(self, stamp: int) -> bool:
+        """Whether an episode was announced that began before the view of ``stamp``, and whose first view has not come.
+
+        So it is for a node that starts in the middle of an episode of more views than are kept for late subscribers.
+        """
+        return self._expected is not None and self._expected.stamp < stamp
+
     def awaited(self) -> Awaited:
         """What the view that began last lacks; between two views, the first topic of the next one."""
         missing = self._views.missing()
