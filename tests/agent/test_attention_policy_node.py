@@ -26,7 +26,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose,
 )
-from active6d_core.ros.episode_messages import GoalState, GoalStatus
+from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, GoalState, GoalStatus
 from active6d_core.view_sphere import ViewSphere
 
 SPHERE = ViewSphere()
@@ -49,8 +49,8 @@ class Episode:
         graph.spin_until(lambda: all(output.get_subscription_count() for output in outputs))
         self.stamp = 0
 
-    def start(self, stamp):
-        announcement = DiagnosticArray(header=make_header(stamp, "world"), status=[DiagnosticStatus(name="episode")])
+    def start(self, stamp, **info):
+        announcement = EpisodeStart(stamp, "world", info).to_message()
         self.graph.publish("episode/start", announcement, latched=True)
 
     def pose(self, view, stamp):
@@ -124,6 +124,27 @@ def test_a_policy_that_starts_within_an_episode_without_its_first_views_ends_it(
     played.graph.spin_until(lambda: len(played.ends) == 1)
     assert played.ends[0].status[0].message.startswith("attention_policy was started again")
     assert len(played.goals) == 0
+
+
+def test_the_answer_of_another_episodes_camera_is_refused(episode):
+    played = episode()
+    played.start(SECOND, id="mine")
+    played.view(40)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+    for name, goals in (("other", 1), ("mine", 2)):
+        status = GoalStatus(SECOND, "world", GoalState.REFUSED, "no", name)
+        played.graph.publish("view_goal/status", status.to_message(), latched=True)
+        played.graph.spin_until(lambda: len(played.errors()) == 1)
+        played.graph.spin_until(lambda goals=goals: len(played.goals) == goals)
+    assert "it belongs to episode 'other', this one is 'mine'" in played.errors()[0]
+
+
+def test_the_end_names_its_episode(episode):
+    played = episode(steps=0)
+    played.start(SECOND, id="mine")
+    played.view(40)
+    played.graph.spin_until(lambda: len(played.ends) == 1)
+    assert EpisodeEnd.from_message(played.ends[0]).episode == "mine"
 
 
 def test_the_seed_decides(make_objects):

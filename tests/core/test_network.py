@@ -23,7 +23,7 @@ from active6d_core.ros.network import (
     keep_on_this_machine,
 )
 from active6d_core.ros.node import GraphNode
-from active6d_core.ros.publishers import live_publishers
+from active6d_core.ros.publishers import live_publishers, others_in_domain
 from active6d_core.ros.topics import CAMERA_DEPTH
 
 SOCKETS = """
@@ -151,3 +151,18 @@ def test_the_publisher_of_a_killed_process_does_not_count(graph):
     graph.publish("camera/depth/image_raw", image, latched=True)
     graph.spin_until(lambda: viewer.count == 1)
     assert viewer.count_publishers("camera/depth/image_raw") == 2  # the middleware does not know yet
+
+
+def test_other_nodes_in_a_domain_are_named(graph):
+    viewer = graph.add(Viewer(context=graph.context))
+    other = Context()
+    other.init(args=[], domain_id=graph.domain)
+    strangers = [Node(name, context=other) for name in ("stranger", "viewer", "_hidden")]
+    expected = ["/tester", "/viewer"]
+    graph.spin_until(
+        lambda: others_in_domain(viewer, [*expected, "/viewer"]) == ["/stranger"] or None, what="the other graph's"
+    )
+    assert "/viewer" not in others_in_domain(viewer, [*expected, "/viewer"])
+    for stranger in strangers:
+        stranger.destroy_node()
+    other.try_shutdown()

@@ -118,6 +118,7 @@ def test_ground_truth_and_episode_are_told_once(watched, mugs):
     (truth,), (start,) = watched.boxes["ground_truth/poses"], watched.boxes["episode/start"]
     np.testing.assert_allclose(poses_from_array(truth, "world"), mugs.T_world_object, atol=1e-9)
     values = {item.key: item.value for item in start.status[0].values}
+    assert values.pop("id") == "mug/test/0, view 45, seed 3, 1.000 s"
     assert values == {"object": "mug", "scene": "mug/test/0", "seed": "3", "start_view": "45"}
     watched.goal(SPHERE.pose(SPHERE.positions[46]))
     watched.wait(2)
@@ -211,7 +212,7 @@ def test_every_goal_is_answered_with_its_own_stamp(watched):
     watched.wait(3)
     watched.graph.spin_until(lambda: len(watched.answers) == 4)
     expected = [
-        GoalStatus(stamp, "world", state)
+        GoalStatus(stamp, "world", state, "", "mug/test/0, view 45, seed 0, 1.000 s")
         for stamp in watched.stamps()[:2]
         for state in (GoalState.ACCEPTED, GoalState.REACHED)
     ]

@@ -109,6 +109,7 @@ def test_episode_and_ground_truth(graph, folder):
     watched = Watched(graph, folder, object="mug", object_id=3, seed=4)
     graph.spin_until_filled([watched.starts, watched.truth])
     values = {item.key: item.value for item in watched.starts[0].status[0].values}
+    assert values.pop("id").startswith(str(folder))
     assert values == {"object": "mug", "scene": str(folder), "seed": "4", "start_view": "0"}
     np.testing.assert_allclose(poses_from_array(watched.truth[0], "world"), three_mugs().T_world_object, atol=1e-9)
     watched.goal(90.0)

@@ -20,7 +20,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, GoalState, GoalStatus
+from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, GoalState, GoalStatus, check_episode
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
@@ -93,6 +93,7 @@ class AttentionPolicyNode(GraphNode):
 
     def _forget(self) -> None:
         self._episode: EpisodeState | None = None
+        self._episode_id = ""
         self._latest: tuple[int, SceneObjects, np.ndarray] | None = None
         self._published: list[tuple[Any, Any]] = []
         self._views.reset()
@@ -140,6 +141,7 @@ class AttentionPolicyNode(GraphNode):
     def _on_start(self, start: EpisodeStart, new: bool) -> None:
         views = {} if new or self._episode is None else self._episode.views_from(start.stamp)
         episode = self._begin_episode(start.stamp)
+        self._episode_id = start.id
         if new:
             self._latest = None
             return
@@ -188,6 +190,7 @@ class AttentionPolicyNode(GraphNode):
 
     def _on_status(self, message: DiagnosticArray) -> None:
         status = GoalStatus.from_message(message, self.world_frame)
+        check_episode(status.episode, self._episode_id)
         episode, latest = self._episode, self._latest
         if episode is None or latest is None or status.stamp != latest[0]:
             return
@@ -233,6 +236,8 @@ class AttentionPolicyNode(GraphNode):
             "moves": str(moves),
             "metres": f"{travelled:.6f}",
         }
+        if self._episode_id:
+            values["episode"] = self._episode_id
         self._publish(self.end, EpisodeEnd(stamp, self.world_frame, reason, values).to_message())
         self.get_logger().info(f"episode ended after {moves} moves and {travelled:.2f} m: {reason}")
 

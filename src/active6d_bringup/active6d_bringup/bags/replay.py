@@ -18,7 +18,6 @@ from active6d_bringup.bags.writer import TYPESTORE, stamp_of
 from active6d_bringup.graph.composition import (
     GraphDescription,
     OnEvent,
-    check_parameters,
     default_params_file,
     running,
 )
@@ -187,7 +186,6 @@ def describe(
         "pose_estimator": estimator,
         "hypothesis_fusion": {**recorded.get("hypothesis_fusion", {}), "object": name},
     }
-    check_parameters(settings.overrides)
     nodes = {name: {**frames, **parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
     return GraphDescription(nodes, settings.params_file or default_params_file(), domain=settings.domain)
 

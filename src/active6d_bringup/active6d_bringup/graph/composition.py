@@ -18,6 +18,7 @@ from active6d_core.interrupts import INTERRUPTS
 from active6d_core.nearest_name import did_you_mean
 from active6d_core.ros.graph_nodes import NODES
 from active6d_core.ros.network import DomainClaim, domain_of
+from active6d_core.ros.publishers import others_in_domain
 from active6d_core.structured_text import read_yaml
 
 OnEvent = Callable[[str], None]
@@ -72,6 +73,13 @@ class GraphDescription:
     @cached_property
     def _claim(self) -> DomainClaim:
         return DomainClaim(self.domain if self.domain is not None else domain_of(), self.namespace)
+
+    def foreign_nodes(self, node: Node) -> list[str]:
+        """Full names of other nodes in a domain that the user named, as ``node`` of this graph has discovered them."""
+        if self.domain is None and domain_of() is None:
+            return []
+        space = f"/{self.namespace.strip('/')}/" if self.namespace else "/"
+        return others_in_domain(node, [space + name for name in (*self.nodes, "supervisor")])
 
     def release_domain(self) -> None:
         """Let others have the domain."""

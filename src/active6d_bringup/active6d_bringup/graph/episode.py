@@ -23,7 +23,6 @@ from active6d_bringup.graph.composition import (
     Graph,
     GraphDescription,
     OnEvent,
-    check_parameters,
     default_params_file,
     running,
 )
@@ -39,7 +38,7 @@ from active6d_core.ros.conversions import (
     poses_from_array,
     stamp_to_ns,
 )
-from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, episode_info
+from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, check_episode, episode_info
 from active6d_core.ros.node import qos_of
 from active6d_core.view_sphere import ViewSphere
 
@@ -174,10 +173,13 @@ def run_episode(
         events.append(text)
         on_event(text)
 
-    with interruptible() as interrupted, running(make_graph(settings, describe(settings), note, interrupted)) as graph:
+    description = describe(settings)
+    with interruptible() as interrupted, running(make_graph(settings, description, note, interrupted)) as graph:
         monitor = EpisodeMonitor(graph.context, settings.namespace, on_step)
         graph.add(monitor)
         graph.start()
+        if others := description.foreign_nodes(monitor):
+            note(f"also in ROS domain {description.domain_id()}: {', '.join(others)}")
         _spin_to_end(graph, monitor, settings.patience, interrupted, note)
         return monitor.result(settings, events)
 
@@ -212,7 +214,6 @@ def describe(settings: EpisodeSettings) -> GraphDescription:
     if unknown:
         hint = did_you_mean(min(unknown), nodes)
         raise ValueError(f"no node '{min(unknown)}' in an episode{hint}; there are {', '.join(nodes)}")
-    check_parameters(settings.overrides)
     nodes = {name: {**parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
     if settings.bag is not None:
         nodes["episode_recorder"]["settings"] = json.dumps(nodes)
@@ -405,6 +406,11 @@ class EpisodeMonitor(Node):
 
     def _on_end(self, message: DiagnosticArray) -> None:
         end = EpisodeEnd.from_message(message)
+        try:
+            check_episode(end.episode, self._starts[-1].id if self._starts else "")
+        except MessageError as error:
+            self.last_refusal = [f"{topics.EPISODE_END.name}: {error}"]
+            return
         self._ends.append(end)
         self.end_stamp, self._reason = end.stamp, end.reason
         self._ended = time.monotonic()

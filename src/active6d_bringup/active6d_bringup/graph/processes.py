@@ -200,7 +200,8 @@ class ProcessGraph:
 
 def _end(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
     for process in processes:
-        process.send_signal(signal.SIGINT)
+        # Not SIGINT: a process that still imports would print a traceback.
+        process.terminate()
     deadline = time.monotonic() + seconds
     for process in processes:
         try:

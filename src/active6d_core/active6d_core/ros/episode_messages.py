@@ -21,7 +21,8 @@ class EpisodeStart:
     Attributes:
         stamp: of the first view, nanoseconds.
         frame: name of the world's frame.
-        info: what is in the bin: ``object``, ``scene``, ``seed``, ``start_view``, as far as the camera knows.
+        info: what is in the bin: ``object``, ``scene``, ``seed``, ``start_view``, as far as the camera knows; and
+            ``id``, by which later messages name the episode.
     """
 
     stamp: int
@@ -38,6 +39,11 @@ class EpisodeStart:
         """Read a message; one without a status has no information."""
         return cls(stamp_to_ns(message.header.stamp), message.header.frame_id, _values(message))
 
+    @property
+    def id(self) -> str:
+        """The episode's id; empty for a camera that gives none, and in recordings of earlier versions."""
+        return self.info.get("id", "")
+
 
 @dataclass(frozen=True)
 class EpisodeEnd:
@@ -47,7 +53,8 @@ class EpisodeEnd:
         stamp: of the last view, nanoseconds.
         frame: name of the world's frame.
         reason: why the episode ended, in words.
-        info: ``policy``, ``seed``, ``moves`` and ``metres``, as far as the publisher knows.
+        info: ``policy``, ``seed``, ``moves`` and ``metres``, and ``episode``, the id of the episode; as far as the
+            publisher knows.
     """
 
     stamp: int
@@ -64,6 +71,11 @@ class EpisodeEnd:
         """Read a message; one without a status has no reason."""
         reason = message.status[0].message if message.status else ""
         return cls(stamp_to_ns(message.header.stamp), message.header.frame_id, reason, _values(message))
+
+    @property
+    def episode(self) -> str:
+        """The id of the episode that ends; empty if it is not known."""
+        return self.info.get("episode", "")
 
 
 def episode_info(starts: Iterable[EpisodeStart], ends: Iterable[EpisodeEnd]) -> dict[str, str]:
@@ -89,17 +101,20 @@ class GoalStatus:
         frame: name of the world's frame.
         state: accepted, refused or reached.
         reason: why, in words; empty if there is nothing to say.
+        episode: id of the camera's episode; empty if it gives none.
     """
 
     stamp: int
     frame: str
     state: GoalState
     reason: str = ""
+    episode: str = ""
 
     def to_message(self) -> DiagnosticArray:
         """The message to publish; a refusal has the level WARN."""
         level = DiagnosticStatus.WARN if self.state is GoalState.REFUSED else DiagnosticStatus.OK
-        status = make_status("view_goal", self.reason, {"state": self.state.value}, level)
+        values = {"state": self.state.value} | ({"episode": self.episode} if self.episode else {})
+        status = make_status("view_goal", self.reason, values, level)
         return _to_message(self.stamp, self.frame, status)
 
     @classmethod
@@ -111,12 +126,24 @@ class GoalStatus:
         """
         if frame is not None and message.header.frame_id != frame:
             raise MessageError(f"frame_id is '{message.header.frame_id}', expected '{frame}'")
-        state = _values(message).get("state", "")
+        values = _values(message)
+        state = values.get("state", "")
         if state not in (known.value for known in GoalState):
             known = ", ".join(state.value for state in GoalState)
             raise MessageError(f"goal state is '{state}', expected one of {known}")
         stamp = stamp_to_ns(message.header.stamp)
-        return cls(stamp, message.header.frame_id, GoalState(state), message.status[0].message)
+        reason, episode = message.status[0].message, values.get("episode", "")
+        return cls(stamp, message.header.frame_id, GoalState(state), reason, episode)
+
+
+def check_episode(found: str, expected: str) -> None:
+    """Check that a message belongs to the episode at hand, as far as both ids are known.
+
+    Raises:
+        MessageError: it belongs to another episode.
+    """
+    if found and expected and found != expected:
+        raise MessageError(f"it belongs to episode '{found}', this one is '{expected}'; is another graph here?")
 
 
 def _to_message(stamp: int, frame: str, status: DiagnosticStatus) -> DiagnosticArray:

@@ -1,6 +1,8 @@
 """Which nodes publish a topic, without those whose process is gone."""
 
 import os
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -42,3 +44,14 @@ def _process_numbers() -> set[bytes]:
     """The lowest two bytes of the ids of all processes, as in a GUID."""
     ids = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdecimal()] or [os.getpid()]
     return {(process & 0xFFFF).to_bytes(2, "little") for process in ids}
+
+
+def others_in_domain(node: Node, expected: Iterable[str]) -> list[str]:
+    """Full names of the nodes that ``node`` has discovered beside itself and the expected ones, each once.
+
+    A node that has an expected name, but is there twice, is another graph's.
+    """
+    found = Counter(f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces())
+    surplus = found - Counter([*expected, node.get_fully_qualified_name()])
+    # Tools of the command line make hidden nodes, which publish nothing of a graph.
+    return sorted(name for name in surplus if not name.rpartition("/")[2].startswith("_"))

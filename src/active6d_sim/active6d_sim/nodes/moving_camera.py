@@ -50,7 +50,7 @@ class MovingCameraNode(GraphNode):
         )
         self.declare("camera_speed", 0.25, "speed of the camera in metres per second of simulated time", minimum=1e-3)
         self.declare("radius", 0.8, "radius of the hemisphere of views in metres", minimum=0.1)
-        self._stamp = 0
+        self._stamp, self._episode = 0, ""
         self._clock_output = ClockOutput(self)
         self._color = self.output(topics.CAMERA_COLOR)
         self._depth = self.output(topics.CAMERA_DEPTH)
@@ -141,6 +141,9 @@ class MovingCameraNode(GraphNode):
     def _announce(self, start: int) -> None:
         values = {"object": self.object_name, "scene": self.scene_name}
         values |= {"seed": str(self.seed), "start_view": str(start)}
+        # No random number: the same seed gives the same messages.
+        self._episode = f"{self.scene_name}, view {start}, seed {self.seed}, {self._stamp * 1e-9:.3f} s"
+        values["id"] = self._episode
         self._start.publish(EpisodeStart(self._stamp, self.world_frame, values).to_message())
         T_world_object = self.truth(start)
         if T_world_object is not None:
@@ -169,7 +172,7 @@ class MovingCameraNode(GraphNode):
             raise MessageError(str(error)) from error
 
     def _answer(self, stamp: int, state: GoalState, reason: str = "") -> None:
-        self._status.publish(GoalStatus(stamp, self.world_frame, state, reason).to_message())
+        self._status.publish(GoalStatus(stamp, self.world_frame, state, reason, self._episode).to_message())
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """A new episode in the same scene."""

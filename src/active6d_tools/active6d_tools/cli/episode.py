@@ -60,6 +60,7 @@ def episode(
         option = "--report" if report is not None else "--figure"
         raise ValueError(f"{option} needs --bag, because it is made from the bag")
     with messages.status("starting"):
+        from active6d_bringup.graph.composition import check_parameters
         from active6d_bringup.graph.episode import EpisodeSettings
 
         settings = EpisodeSettings(
@@ -77,6 +78,7 @@ def episode(
             overrides=parse_overrides(override or []),
         )
         _check_names(settings)
+        check_parameters(settings.overrides)
     result = _run(settings)
     summary = _summary(result)
     _print_summary(result, summary)

@@ -54,6 +54,7 @@ def replay(
         raise ValueError("--rate and --as-fast exclude each other")
     from active6d_bringup.bags.camera_topics import CameraOptions
     from active6d_bringup.bags.replay import ReplaySettings
+    from active6d_bringup.graph.composition import check_parameters
 
     settings = ReplaySettings(
         bag=folder,
@@ -65,6 +66,7 @@ def replay(
         params_file=params_file,
         overrides=parse_overrides(override or []),
     )
+    check_parameters(settings.overrides)
     result = _run(settings)
     console.print(f"{result.views} views in {result.seconds:.1f} s", highlight=False)
     print_left_out(result.left_out, result.notes)
