@@ -105,7 +105,7 @@ class GraphNode(DiagnosticNode):
             )
 
     def _take_from_one(self, topic: Topic, callback: Callable[[Any], None], message: Any) -> None:
-        """Hand a message on, unless nodes of several graphs publish the topic: nobody could say whose it is."""
+        """Pass a message on, unless nodes of several graphs publish the topic: its origin would be unknown."""
         if topic.publisher and self.count_publishers(topic.name) > 1:
             names = live_publishers(self, topic.name)
             if len(names) > 1:

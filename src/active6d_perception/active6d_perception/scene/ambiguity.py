@@ -91,7 +91,7 @@ class Ambiguity:
 
     @cached_property
     def telling_points(self) -> np.ndarray:
-        """(p, 3) points of the surface that tells rotations apart, evenly spaced, object frame, metres."""
+        """(p, 3) points of the surface that distinguishes rotations, evenly spaced, object frame, metres."""
         return self._spread(self.telling, _TELLING_SAMPLES)
 
     @cached_property
@@ -111,12 +111,12 @@ class Ambiguity:
 
     @cached_property
     def telling_samples(self) -> VisibleSamples:
-        """Of the surface that tells rotations apart."""
+        """Of the surface that distinguishes rotations."""
         return visible_samples(self.views, self.telling, _TELLING_SAMPLES, self.model.mesh.area)
 
     @cached_property
     def twin_samples(self) -> VisibleSamples:
-        """Of the surface that tells twins apart."""
+        """Of the surface that distinguishes twins."""
         return visible_samples(self.views, self.telling_twins, _TELLING_SAMPLES, self.model.mesh.area)
 
     @cached_property

@@ -1,8 +1,8 @@
 """Refines poses jointly over the depth images of several views, by visible-surface ICP in the world.
 
 Each step takes the equations of every view at the pose rounded to a lattice (:mod:`.pose_lattice`). So the equations of
-a view depend on the rounded pose alone and are remembered: another view costs its own equations, and results do not
-depend on the order in which views came.
+a view depend on the rounded pose alone and are cached: a new view adds only its own equations, and the result does not
+depend on the order of views.
 """
 
 from collections.abc import Sequence

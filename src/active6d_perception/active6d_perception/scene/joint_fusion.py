@@ -1,11 +1,11 @@
-"""Fusion that weighs every view: bodies refined over all depth images, and a belief over what is ambiguous.
+"""Fusion of the depth images of all views: bodies are refined jointly, and a belief resolves ambiguous poses.
 
-:class:`.SceneFusion` keeps the best hypothesis of a single view. This fusion takes hypotheses only as proposals. What
-every depth image measured at a candidate's place decides: the surface where it should be, something before it, or a
-look through it. And solid objects cannot overlap.
+:class:`.SceneFusion` keeps the best hypothesis of a single view. This fusion uses hypotheses only as proposals. The
+evidence is what every depth image measured where a candidate has its surface: that surface, something in front of it,
+or something behind it. Poses in which solid objects overlap are improbable.
 
-Everything follows from the set of views: their order changes nothing. What a view says of a pose is computed once and
-remembered (:mod:`.memo`), so another view costs its own part.
+The result depends on the set of views, not on their order. The comparison of a pose with a view is computed once and
+cached (:mod:`.memo`), so the cost of a new view does not grow with the number of views before it.
 """
 
 from dataclasses import dataclass, replace
@@ -44,7 +44,7 @@ _BESIDE = 1.3
 # Refinement, metres: gates of the steps, and the lattice. Bodies are many and only compared; what is reported is finer.
 _BODY_GATES, _BODY_LATTICE = (0.008, 0.004, 0.004), 0.002
 _WHOLE_GATES, _WHOLE_LATTICE = (0.008, 0.004), 0.0005
-# A body whose log-odds are so much below the best at its place is not looked at further.
+# A body whose log-odds are this far below those of the best at its place is dropped.
 _HOPELESS = 12.0
 # Evidence is taken at poses on this lattice, metres.
 _LATTICE = 0.001

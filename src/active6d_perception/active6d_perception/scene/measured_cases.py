@@ -1,7 +1,7 @@
 """What each view measured where a pose puts the object's surface, counted in pixels by case.
 
-A case says two things about a pixel. *What* was measured there: the surface itself, something before it (the surface is
-hidden), something behind it (the camera looked through it). And *whose* it is: the pixel belongs to the instance at
+A case has two parts. *What* was measured at a pixel: the surface itself, something in front of it (the surface is
+hidden), or something behind it (the camera looked through it). *Whose* the pixel is: it belongs to the instance at
 this place, to another one or to none.
 """
 

@@ -1,4 +1,4 @@
-"""What fusion keeps of a view: the measured surface at a low resolution, whose it is, and where the camera was."""
+"""The part of a view that fusion stores: measured surface at low resolution, its instances, and the camera's pose."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Remembers rows of tables by key, so that what was computed once for a pose is not computed again."""
+"""A cache of table rows by key, so that a result for a pose is computed once."""
 
 from collections.abc import Callable, Hashable, Sequence
 
@@ -6,9 +6,9 @@ import numpy as np
 
 
 class Memo:
-    """Rows by key. Those not asked for between two calls of :meth:`sweep` are forgotten.
+    """Rows by key. Rows that are not used between two calls of :meth:`sweep` are removed.
 
-    What is remembered never changes a result, if ``compute`` depends on nothing but the key.
+    The cache does not change a result if ``compute`` depends on the key alone.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The probability that a fused object is right, from all that is known of it."""
+"""The probability that a fused object is right, from its belief, its evidence and its hypotheses."""
 
 import numpy as np
 

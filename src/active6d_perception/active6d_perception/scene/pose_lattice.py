@@ -1,4 +1,4 @@
-"""Rounds poses, so that a pose that hardly moved is the same as before and what was computed for it stays valid."""
+"""Rounding of poses: a pose that hardly moved keeps its rounded pose, and results cached for that stay valid."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Decides for each place in a scene which body is there and how it is rotated, and how sure that is."""
+"""Selects the body and the rotation at each place in a scene, with their probability."""
 
 from dataclasses import dataclass
 

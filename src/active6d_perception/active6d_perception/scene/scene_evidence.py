@@ -1,5 +1,4 @@
-"""What all views and the laws of solid bodies say for and against each candidate, as numbers that weights turn into a
-belief."""
+"""Evidence for and against each candidate, from all views and from overlaps of solids: the input of the belief."""
 
 from dataclasses import dataclass
 
@@ -56,12 +55,12 @@ BODY_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class BodyEvidence:
-    """Evidence on K bodies, whatever their rotations.
+    """Evidence on K bodies, independent of their rotations.
 
     Attributes:
         candidates: the bodies.
-        body: (K, CASES) counts of the surface that does not tell rotations apart, see :mod:`.measured_cases`.
-        twin: (K, CASES) counts of the part of it that tells twins apart.
+        body: (K, CASES) counts of the surface that looks the same at all rotations, see :mod:`.measured_cases`.
+        twin: (K, CASES) counts of the part of it that distinguishes twins.
         container: (K, 5) of that surface, see :func:`.against_container`.
         neighbours: (K, 2) of that surface, see :func:`.against_neighbour`; shares are summed over the neighbours, of
             the distances it is the least.

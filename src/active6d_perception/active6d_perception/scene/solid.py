@@ -1,4 +1,4 @@
-"""The solid part of an object as a grid of signed distances, to find overlaps and points on its surface."""
+"""An object's solid as a grid of signed distances, to find overlaps and points on its surface."""
 
 from typing import NamedTuple
 
