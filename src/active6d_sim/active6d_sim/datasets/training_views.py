@@ -32,6 +32,7 @@ _VIEWS_PER_APPEARANCE = 4
 _WILD_SHARE = 0.75
 #: Widths and heights of images of wild scenes, pixels; one per scene.
 _SIZES = ((640, 480), (640, 480), (640, 360), (512, 424), (720, 540))
+_TRUTH_SCALE = 0.25  # resolution of the truth relative to the view
 _TOO_NEAR = 0.15  # metres
 _TRIES = 4  # cameras until one sees something useful
 
@@ -94,7 +95,6 @@ def training_views(
     count: int,
     rng: np.random.Generator,
     *,
-    truth_scale: float = 0.25,
     threads: int = 0,
 ) -> Iterator[TrainingView]:
     """Simulate views of a scene from random cameras; the appearance changes every few views.
@@ -107,7 +107,6 @@ def training_views(
         model: its object.
         count: number of views.
         rng: random generator.
-        truth_scale: resolution of the truth relative to the view.
         threads: number of threads for ray casting, 0 for one per core.
     """
     wild = scene.surroundings is not None
@@ -119,7 +118,7 @@ def training_views(
         sensor = random_sensor(rng) if wild else ActiveStereo().scaled(rng.uniform(0, 2))
         for _ in range(_TRIES):
             camera, T_world_camera = (wild_camera if wild else random_camera)(rng, *size)
-            item = _capture(renderer, camera, T_world_camera, sensor, rng, truth_scale)
+            item = _capture(renderer, camera, T_world_camera, sensor, rng)
             if not wild or _useful(item):
                 break
         yield item
@@ -132,7 +131,7 @@ def _useful(item: TrainingView) -> bool:
 
 
 def validation_views(
-    object_name: str, split: str, index: int, *, count: int = 12, truth_scale: float = 0.25, threads: int = 0
+    object_name: str, split: str, index: int, *, count: int = 12, threads: int = 0
 ) -> Iterator[TrainingView]:
     """Simulate views of one stored scene with the simulator's default camera, and its default sensor or, of a wild
     scene, random ones.
@@ -142,7 +141,6 @@ def validation_views(
         split: ``val`` or ``wild_val``.
         index: of the scene in the split.
         count: number of views, drawn from the grid of the view hemisphere.
-        truth_scale: resolution of the truth relative to the view.
         threads: number of threads for ray casting, 0 for one per core.
     """
     scene = load_scene(object_name, split, index)
@@ -150,7 +148,7 @@ def validation_views(
     rng, sphere = np.random.default_rng(scene.seed), ViewSphere()
     for view in rng.choice(len(sphere), count, replace=False):
         sensor = sensor_of(AUTOMATIC, renderer.model, scene, int(view))
-        yield _capture(renderer, DEFAULT_CAMERA, sphere.pose(sphere.positions[view]), sensor, rng, truth_scale)
+        yield _capture(renderer, DEFAULT_CAMERA, sphere.pose(sphere.positions[view]), sensor, rng)
 
 
 def _capture(
@@ -159,11 +157,10 @@ def _capture(
     T_world_camera: np.ndarray,
     sensor: Sensor,
     rng: np.random.Generator,
-    truth_scale: float,
 ) -> TrainingView:
     rendered = renderer.render(T_world_camera, camera)
     color, depth = sensor.measure(rendered, camera, rng)
-    coarse = camera.scaled(truth_scale)
+    coarse = camera.scaled(_TRUTH_SCALE)
     truth = renderer.render(T_world_camera, coarse, shaded=False)
     visible, whole = renderer.instance_layers(T_world_camera, coarse)
     return TrainingView(
