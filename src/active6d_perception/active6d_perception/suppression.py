@@ -6,6 +6,8 @@ Fusion and the agent's training environment both call the latter, so that they k
 
 import numpy as np
 
+from active6d_perception.compiled import compiled
+
 
 def suppress(distance: np.ndarray, score: np.ndarray, radius: float) -> np.ndarray:
     """Greedy non-maximum suppression of one list, from a table of distances.
@@ -41,8 +43,16 @@ def suppress_neighbours(positions: np.ndarray, valid: np.ndarray, exclusion: flo
     kept = valid.copy()
     norm = (positions**2).sum(axis=-1)
     squared = norm[:, :, None] + norm[:, None] - 2.0 * positions @ np.swapaxes(positions, 1, 2)
-    close = (squared < exclusion**2) & np.tri(positions.shape[1], k=-1, dtype=bool)
-    # Only an item with a better neighbour can be dropped; whether that neighbour is kept is known in list order.
-    for index in np.flatnonzero(close.any(axis=(0, 2))):
-        kept[:, index] &= ~(close[:, index] & kept).any(axis=1)
+    _drop(squared < exclusion**2, kept)
     return kept
+
+
+@compiled
+def _drop(close: np.ndarray, kept: np.ndarray) -> None:
+    """Drop, in place, what is close to a better item that is kept; that is known in list order."""
+    for b in range(len(kept)):
+        for index in range(kept.shape[1]):
+            for better in range(index):
+                if close[b, index, better] and kept[b, better]:
+                    kept[b, index] = False
+                    break

@@ -191,6 +191,7 @@ class SceneFusion:
         # Compile now, so that no view has to wait.
         nothing = np.zeros(0, np.int64)
         summarise(nothing, nothing, nothing, np.zeros((0, 0)), 0)
+        suppress_neighbours(np.zeros((1, 0, 3)), np.zeros((1, 0), bool), 0.0)
 
     def reset(self) -> None:
         """Forget all views."""
