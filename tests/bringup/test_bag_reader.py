@@ -153,6 +153,15 @@ def test_a_flipped_byte_is_reported(tmp_path, whole, seed):
     assert damage_of(folder)
 
 
+@pytest.mark.parametrize("byte", range(8))
+def test_an_index_that_is_said_to_be_beyond_the_end_is_reported(tmp_path, whole, byte):
+    folder = shutil.copytree(whole[0], tmp_path / "bag")
+    data = bytearray((folder / "bag.mcap").read_bytes())
+    data[len(data) - 8 - 20 + byte] ^= 0xF0  # the footer's first number, before a second, a checksum and the magic
+    (folder / "bag.mcap").write_bytes(data)
+    assert damage_of(folder)
+
+
 def test_a_whole_bag_has_no_damage(whole):
     assert read_episode(whole[0]).damage == ()
 

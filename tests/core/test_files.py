@@ -49,3 +49,13 @@ def test_everybody_may_read_a_written_file(tmp_path):
     (tmp_path / "plain").touch()
     assert (tmp_path / "picture.png").read_bytes() == b"\x89PNG"
     assert (tmp_path / "picture.png").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    words = r"file/active6d/banks cannot be written \(Not a directory\); set XDG_CACHE_HOME"
+    with pytest.raises(OSError, match=words):
+        write_file(cache_folder("banks") / "a.npz", "")
+    with pytest.raises(OSError, match=r"cannot be written.*choose another folder"):
+        write_file(tmp_path / "file" / "a", "")

@@ -1,6 +1,9 @@
 """episode, report and replay as a user types them one after the other, with stubs for camera and estimator."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,4 +113,14 @@ def test_an_episode_that_fails_is_one_line(monkeypatch, run, error, options, cod
     assert result.exit_code == code
     assert result.stderr.splitlines()[-1] == line
     assert result.stdout == ""
+    assert "Traceback" not in result.stderr
+
+
+def test_a_log_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    environment = {**os.environ, "ROS_LOG_DIR": str(tmp_path / "file" / "log")}
+    command = [sys.executable, "-m", "active6d_tools", "episode", "--object", "mug", "--steps", "0"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert result.returncode == 2
+    assert "the log folder cannot be written; set ROS_LOG_DIR" in result.stderr
     assert "Traceback" not in result.stderr

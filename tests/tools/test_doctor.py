@@ -46,3 +46,15 @@ def test_a_library_that_breaks_while_loading_is_a_finding(tmp_path, monkeypatch)
     monkeypatch.syspath_prepend(tmp_path)
     check = machine_doctor._import_check("A", "brittle_library", "brittle", needed=True, fix="fix it")
     assert (check.ok, check.detail, check.fix) == (False, "libusb-1.0.so.0: cannot open", "fix it")
+
+
+def test_folders_and_a_domain_that_cannot_be_used_are_findings(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "file" / "log"))
+    monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
+    checks = {check.name: check for check in machine_doctor._surroundings()}
+    assert not any(check.ok for check in checks.values())
+    assert "XDG_CACHE_HOME" in checks["cache folder"].fix
+    assert "ROS_LOG_DIR" in checks["log folder"].fix
+    assert "ROS_DOMAIN_ID is 'seven'" in checks["ROS domain"].detail

@@ -33,8 +33,14 @@ def atomic_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        inside = path.is_relative_to(cache_folder(""))
+        advice = "set XDG_CACHE_HOME to another folder" if inside else "choose another folder"
+        raise OSError(f"{path.parent} cannot be written ({error.strerror}); {advice}") from error
+    with temporary as folder:
         unfinished = Path(folder) / path.name
         yield unfinished
         os.replace(unfinished, path)

@@ -102,6 +102,16 @@ class Registry(Generic[_Part]):
             known = ", ".join(accepted) if accepted else "none"
             hint = did_you_mean(unknown[0], accepted)
             raise ValueError(f"{self._kind} '{name}' has no parameter '{unknown[0]}'{hint}; it has: {known}")
+        needed = [
+            parameter.name
+            for parameter in inspect.signature(factory).parameters.values()
+            if parameter.name in accepted and parameter.name not in parameters and _is_needed(parameter)
+        ]
+        if needed:
+            raise ValueError(
+                f"{self._kind} '{name}' needs the parameter '{needed[0]}'; give it with --set, such as "
+                f"{name}.{needed[0]}=VALUE, or for a node in {self._kind}_parameters"
+            )
         try:
             return factory(model, **parameters)
         except (TypeError, ValueError) as error:
@@ -202,6 +212,11 @@ def leave_out_broken_imports() -> list[str]:
 
 def _requested_modules() -> list[str]:
     return [module.strip() for module in os.environ.get(IMPORT_VARIABLE, "").split(",") if module.strip()]
+
+
+def _is_needed(parameter: inspect.Parameter) -> bool:
+    variable = parameter.kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return parameter.default is inspect.Parameter.empty and not variable
 
 
 def _distribution(entry_point: EntryPoint) -> str:

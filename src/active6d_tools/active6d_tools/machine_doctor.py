@@ -11,8 +11,12 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from active6d_core.files import cache_folder
+from active6d_core.ros.network import domain_of
 
 PIP = "pip install -r requirements.txt"
 APT_ROS = "only with an apt installation of ROS 2 Jazzy: apt install ros-jazzy-"
@@ -45,6 +49,7 @@ def examine() -> Iterator[Check]:
     yield from _libraries()
     yield from _ros()
     yield from _project()
+    yield from _surroundings()
     yield from _self_tests()
 
 
@@ -141,6 +146,27 @@ def _weights() -> Check:
     found = sorted(path.stem for path in folder.glob("*.safetensors"))
     fix = "" if found else "active6d works without (the geometric estimator needs none)"
     return Check("active6d", "estimator weights", bool(found), False, ", ".join(found) or f"none in {folder}", fix)
+
+
+def _surroundings() -> Iterator[Check]:
+    """The folders that are written to, and the ROS domain that the user set."""
+    logs = os.environ.get("ROS_LOG_DIR") or Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "log"
+    folders = (("cache folder", cache_folder(""), "XDG_CACHE_HOME"), ("log folder", Path(logs), "ROS_LOG_DIR"))
+    for name, folder, variable in folders:
+        fix = f"set {variable} to a folder that can be written"
+        yield _attempt("active6d", name, partial(_write_into, folder), fix)
+    yield _attempt("active6d", "ROS domain", _read_domain, "unset ROS_DOMAIN_ID, or set it to a number from 0 to 101")
+
+
+def _write_into(folder: Path) -> str:
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        return str(folder)
+
+
+def _read_domain() -> str:
+    domain = domain_of()
+    return "a free one for each command" if domain is None else str(domain)
 
 
 def _self_tests() -> Iterator[Check]:

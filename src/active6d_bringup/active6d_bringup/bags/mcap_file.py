@@ -137,6 +137,9 @@ class McapFile:
     def _check_summary(self, file: BinaryIO, footer: Footer, size: int) -> None:
         if not footer.summary_crc:
             return
+        if footer.summary_start > size:
+            self._note("has an index beyond its end")
+            return
         position = file.tell()
         file.seek(footer.summary_start)
         covered = file.read(size - footer.summary_start - _MAGIC_BYTES - 4)

@@ -191,6 +191,8 @@ def open_context(description: GraphDescription) -> Context:
     try:
         context.init(args=description.ros_arguments(), domain_id=description.domain_id())
     except RuntimeError as error:
+        if "log" in str(error) and description.params_file == default_params_file():
+            raise ValueError(f"the log folder cannot be written; set ROS_LOG_DIR to another one ({error})") from error
         raise ValueError(f"params file {description.params_file}: {error}") from error
     return context
 
