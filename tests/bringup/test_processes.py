@@ -9,6 +9,7 @@ import time
 import numpy as np
 import psutil
 import pytest
+from rclpy.task import Future
 from ros_harness import fresh_domain
 
 from active6d_bringup.bags.reader import read_episode
@@ -132,6 +133,24 @@ def test_node_that_cannot_be_replaced_is_named(graphs):
         graph.processes["camera_simulator"].kill()
         with pytest.raises(ProcessError, match=r"camera_simulator ended \(SIGKILL\)"):
             spin(graph)
+
+
+def test_a_question_whose_answer_is_lost_is_asked_again():
+    calls = []
+
+    class Client:
+        def call_async(self, request):
+            calls.append(Future())
+            if len(calls) == 2:
+                calls[-1].set_result("answer")
+            return calls[-1]
+
+    client, answers = Client(), []
+    answers.append(client.call_async(None))
+    now = time.monotonic()
+    assert not processes_module._answered(client, answers, now)
+    assert processes_module._answered(client, answers, now - processes_module._ASK_AGAIN_SECONDS - 1.0)
+    assert len(calls) == 2
 
 
 def test_bad_parameter_is_not_restarted(graphs):

@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from threading import Event
 from typing import Any
 
@@ -28,6 +29,7 @@ from active6d_core.ros.node import connections
 # Nodes have nothing to lose, and one that computes ignores an interrupt. The recorder closes its bag.
 _STOP_SECONDS, _STOP_RECORDER_SECONDS = 1.5, 10.0
 _GRACE_SECONDS = 4.5
+_ASK_AGAIN_SECONDS = 3.0
 
 
 class ProcessError(RuntimeError):
@@ -179,9 +181,9 @@ class ProcessGraph:
         for name in self._description.in_order():
             client = self._node.create_client(Trigger, f"{name}/connections")
             self._wait(client.service_is_ready, f"{name} did not come up")
-            answer = client.call_async(Trigger.Request())
-            self._wait(answer.done, f"{name} did not answer")
-            reports.append(json.loads(answer.result().message))
+            answers = [client.call_async(Trigger.Request())]
+            self._wait(partial(_answered, client, answers, time.monotonic()), f"{name} did not answer")
+            reports += [json.loads(answer.result().message) for answer in answers if answer.done()][:1]
             self._node.destroy_client(client)
         for own, others in (("outputs", "inputs"), ("inputs", "outputs")):
             expected = Counter(topic for report in reports for topic, _ in report[others])
@@ -196,6 +198,16 @@ class ProcessGraph:
             self._wait(answer.done, f"{name} did not answer")
             if not answer.result().success:
                 raise ProcessError(f"{name} could not start; see its own message above")
+
+
+def _answered(client: Client, answers: list[Any], began: float) -> bool:
+    """Whether one of the calls was answered; after some seconds without, one more is made.
+
+    A service that has not discovered its client yet cannot answer: the middleware drops what it sends.
+    """
+    if time.monotonic() > began + _ASK_AGAIN_SECONDS * len(answers):
+        answers.append(client.call_async(Trigger.Request()))
+    return any(answer.done() for answer in answers)
 
 
 def _end(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
