@@ -11,7 +11,13 @@ setup(
     license="Apache-2.0",
     packages=find_packages(),
     package_data={
-        package: ["estimators/dense/weights/*", "estimators/geometric/score.json", "scene/weights/*", "py.typed"]
+        package: [
+            "estimators/dense/weights/*",
+            "estimators/pose_selection.json",
+            "estimators/geometric/score.json",
+            "scene/weights/*",
+            "py.typed",
+        ]
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),

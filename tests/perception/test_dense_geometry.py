@@ -23,14 +23,13 @@ from active6d_core.camera import (
 )
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, rotation_angle, transform_points
-from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
+from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch, likely_axis_rotations
 from active6d_perception.estimators.dense.canonical_frame import (
     AXIS_ANGLES,
     AxisRotation,
     canonical_frame_of,
     rotation_about_z,
 )
-from active6d_perception.estimators.dense.dense_estimator import likely_axis_rotations
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
 from active6d_perception.estimators.dense.network import DIRECTION_BINS, HEADS, DenseNetwork, NetworkSize, fused, split
 from active6d_perception.estimators.dense.network_input import (
@@ -44,6 +43,7 @@ from active6d_perception.estimators.dense.network_input import (
 from active6d_perception.estimators.dense.rigid_fit import kabsch, robust_fit
 from active6d_perception.estimators.dense.sphere_bins import CENTRES, density, kernel
 from active6d_perception.estimators.dense.votes import cluster_votes
+from active6d_perception.estimators.measured_image import measure_image
 
 OBJECTS = {"coffee_cup": AxisRotation.INVISIBLE, "mug": AxisRotation.SHOWN_BY_FEATURE, "bunny": AxisRotation.VISIBLE}
 
@@ -268,9 +268,8 @@ def axis_rotation_likelihood(T_camera_axis, depth, camera, owner=None):
     model = load_object("mug")
     points = backproject(depth, camera)
     owner = np.where(depth < 1.5, 0, -1) if owner is None else owner
-    surface = MeasuredSurface(
-        depth, points, normals_from_points(points, reach=1), owner, camera, None, np.zeros((0, 3))
-    )
+    normals, detail = normals_from_points(points, reach=1), measure_image(depth, camera)
+    surface = MeasuredSurface(depth, points, normals, owner, camera, detail, owner.max() + 1)
     return AxisRotationSearch(model, canonical_frame_of(model)).log_likelihood(T_camera_axis[None], surface)[0]
 
 
@@ -334,9 +333,8 @@ def test_a_network_with_the_wrong_owner_does_not_hide_the_handle():
     handle = (depth < 1.5) & (np.hypot(local[..., 0], local[..., 1]) > 0.046)
     assert handle.sum() > 40
     owner = np.where(handle, 1, np.where(depth < 1.5, 0, -1))
-    surface = MeasuredSurface(
-        depth, points, normals_from_points(points, reach=1), owner, camera, None, np.zeros((0, 3))
-    )
+    normals, detail = normals_from_points(points, reach=1), measure_image(depth, camera)
+    surface = MeasuredSurface(depth, points, normals, owner, camera, detail, owner.max() + 1)
     elsewhere = T_camera_axis.copy()
     elsewhere[0, 3] += 0.3
     found = AxisRotationSearch(model, canonical_frame).log_likelihood(np.stack([T_camera_axis, elsewhere]), surface)[0]
@@ -350,9 +348,8 @@ def test_turns_of_many_mugs_are_those_of_each_alone():
     depth, camera = mug_alone(canonical_frame.object_pose(T_camera_axis[:1])[0])
     points = backproject(depth, camera)
     owner = np.where(depth < 1.5, 0, -1)
-    surface = MeasuredSurface(
-        depth, points, normals_from_points(points, reach=1), owner, camera, None, np.zeros((0, 3))
-    )
+    normals, detail = normals_from_points(points, reach=1), measure_image(depth, camera)
+    surface = MeasuredSurface(depth, points, normals, owner, camera, detail, owner.max() + 1)
     search = AxisRotationSearch(model, canonical_frame)
     together = search.log_likelihood(T_camera_axis, surface)
     assert np.allclose(together[0], search.log_likelihood(T_camera_axis[:1], surface)[0])

@@ -316,7 +316,7 @@ def test_a_small_network_learns_a_view_by_heart(mug_view):
     assert len(hypotheses) == 4
     assert (errors.min(axis=0) < 0.1 * model.diameter).all()
     assert hypotheses.segmentation.shape == view.depth.shape
-    assert set(estimator.stage_ms) == {"input", "network", "decoding", "surface", "poses", "judging", "masks"}
+    assert set(estimator.stage_ms) == {"input", "network", "decoding", "detail", "surface", "poses", "judging", "masks"}
 
 
 def quick(**changes):
@@ -432,11 +432,11 @@ def test_a_fitted_score_is_kept_beside_the_weights(tmp_path, trained):
         (tmp_path / f"copy{suffix}").write_bytes(trained[1].with_suffix(suffix).read_bytes())
     path = tmp_path / "copy.safetensors"
     assert load_network(path, model).score is None
-    save_score(path, ScoreModel(SCORE_FEATURES, np.array([1.0, -2.0, 3.0, 0.5]), -4.0))
+    weights, features = np.linspace(-2.0, 3.0, len(SCORE_FEATURES)), np.linspace(0.0, 1.0, len(SCORE_FEATURES))
+    save_score(path, ScoreModel(SCORE_FEATURES, weights, -4.0))
+    log_odds = sum(float(weight * feature) for weight, feature in zip(weights, features, strict=True)) - 4.0
     score = load_network(path, model).score
-    assert score.probability(np.array([0.5, 0.1, 0.8, 2.0])) == pytest.approx(
-        1 / (1 + np.exp(-(0.5 - 0.2 + 2.4 + 1 - 4)))
-    )
+    assert score.probability(features) == pytest.approx(1 / (1 + np.exp(-log_odds)), rel=1e-3)
     save_score(path, ScoreModel(("other",), np.ones(1), 0.0))
     with pytest.raises(ValueError, match="not a score model: it is for the features other"):
         load_network(path, model)

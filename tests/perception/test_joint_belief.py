@@ -17,9 +17,10 @@ from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform, transform_points
+from active6d_perception.model.ambiguity import ambiguity_of
+from active6d_perception.model.solid import signed_distances, solid_of
 from active6d_perception.model.visible_samples import VisibleSamples
 from active6d_perception.scene import measured_cases as cases
-from active6d_perception.scene.ambiguity import ambiguity_of
 from active6d_perception.scene.belief_training import LabelledPlaces, fit_belief, fit_probability
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer, belief_path, load_belief
 from active6d_perception.scene.expected_visibility import OPEN_TABLE, Tray
@@ -28,7 +29,6 @@ from active6d_perception.scene.measured_view import NORMAL, MeasuredView, measur
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_perception.scene.rotation_belief import decide, posterior
 from active6d_perception.scene.scene_evidence import BODY_COLUMNS, ROTATION_COLUMNS
-from active6d_perception.scene.solid import signed_distances, solid_of
 
 CAMERA = PinholeCamera(320, 240, 277.0, 277.0, 159.5, 119.5)
 IDENTITY = np.eye(4)[None]

@@ -12,7 +12,7 @@ from active6d_core.metrics import e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.scene.ambiguity import ambiguity_of
+from active6d_perception.model.ambiguity import ambiguity_of
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer
 from active6d_perception.scene.expected_visibility import OPEN_TABLE
 from active6d_perception.scene.joint_fusion import JointFusion

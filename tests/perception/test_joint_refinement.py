@@ -11,9 +11,9 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform, rotation_angle, transform_points
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.model.ambiguity import ambiguity_of
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.visible_samples import direction_of, nearest_direction, visible_samples
-from active6d_perception.scene.ambiguity import ambiguity_of
 from active6d_perception.scene.body_candidates import BodyCandidates, gather_candidates, merge_duplicates, number_places
 from active6d_perception.scene.body_refinement import BodyRefinement, normal_equations
 from active6d_perception.scene.measured_view import NORMAL, measure_view

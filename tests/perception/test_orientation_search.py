@@ -8,10 +8,12 @@ from scipy.spatial.transform import Rotation
 from active6d_core.camera import PinholeCamera, backproject, normals_from_points, pixel_rays
 from active6d_core.object_model import load_object
 from active6d_core.se3 import is_rigid, make_transform, transform_points
+from active6d_perception.estimators.dense.canonical_frame import canonical_frame_of
 from active6d_perception.estimators.dense.decoding import Instances
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
 from active6d_perception.estimators.dense.network import DIRECTION_BINS
 from active6d_perception.estimators.dense.orientation_search import OrientationSearch
+from active6d_perception.estimators.measured_image import measure_image
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240, 60.0)
 
@@ -23,7 +25,7 @@ def bunny():
 
 @pytest.fixture(scope="module")
 def search(bunny):
-    return OrientationSearch(bunny)
+    return OrientationSearch(bunny, canonical_frame_of(bunny))
 
 
 def surface_of(model, T_camera_object, owner=0):
@@ -36,7 +38,8 @@ def surface_of(model, T_camera_object, owner=0):
     depth[np.isinf(depth)] = np.nan
     points = backproject(depth, CAMERA)
     owners = np.where(np.isfinite(depth), owner, -1)
-    return MeasuredSurface(depth, points, normals_from_points(points), owners, CAMERA, None, np.zeros((0, 3)))
+    detail = measure_image(depth, CAMERA)
+    return MeasuredSurface(depth, points, normals_from_points(points), owners, CAMERA, detail, owner + 1)
 
 
 def told(T_camera_axis):

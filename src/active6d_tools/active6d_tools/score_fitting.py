@@ -12,7 +12,6 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
-from active6d_perception.estimators.dense.network_input import reduce_view
 from active6d_perception.estimators.dense.trained_network import (
     SCORE_FEATURES,
     SCORE_LOWERED_BY,
@@ -74,7 +73,7 @@ def fit_dense_score(
     estimator = DenseEstimator(model, load_network(weights, model), DenseParameters(min_score=0.0))
 
     def judge(view: View) -> tuple[np.ndarray, np.ndarray]:
-        poses, _ = estimator.locate(reduce_view(view))
+        poses, _ = estimator.locate(view)
         return poses.T_camera_object, poses.features
 
     poses = judge_validation_views(model, judge, views, rng, on_progress)

@@ -32,9 +32,13 @@ class ScoreModel:
         if not (np.isfinite(self.weights).all() and np.isfinite(self.intercept)):
             raise ValueError("the weights of a score model must be finite")
 
+    def margin(self, features: np.ndarray) -> np.ndarray:
+        """(k,) log-odds from (k, f) features."""
+        return np.asarray(features @ self.weights + self.intercept)
+
     def probability(self, features: np.ndarray) -> np.ndarray:
         """(k,) probabilities in (0, 1) from (k, f) features."""
-        return np.asarray(expit(features @ self.weights + self.intercept))
+        return np.asarray(expit(self.margin(features)))
 
     @classmethod
     def fit(

@@ -16,7 +16,7 @@ from torch import nn
 from active6d_core.metrics import DETECTION_FRACTION, e_add
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import transform_points
-from active6d_perception.scene.ambiguity import ambiguity_of
+from active6d_perception.model.ambiguity import ambiguity_of
 from active6d_perception.scene.belief_weights import Scorer
 from active6d_perception.scene.scene_evidence import SceneEvidence
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from active6d_core.se3 import transform_points
-from active6d_perception.scene.ambiguity import Ambiguity
+from active6d_perception.model.ambiguity import Ambiguity
 
 #: Bodies whose middles are nearer than this exclude each other, diameters.
 SAME_PLACE = 0.2

@@ -3,8 +3,8 @@
 import numpy as np
 
 from active6d_perception.compiled import compiled
+from active6d_perception.model.solid import Solid, signed_distances
 from active6d_perception.scene.expected_visibility import Tray
-from active6d_perception.scene.solid import Solid, signed_distances
 
 # Poses are some millimetres off, so that points this deep inside still count as touching; metres.
 _INTO_CONTAINER, _INTO_NEIGHBOUR = 0.003, 0.0015

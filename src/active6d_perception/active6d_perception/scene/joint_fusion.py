@@ -18,8 +18,8 @@ from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.metrics import DETECTION_FRACTION
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, transform_points
+from active6d_perception.model.ambiguity import Ambiguity, ambiguity_of
 from active6d_perception.model.visible_samples import VisibleSamples
-from active6d_perception.scene.ambiguity import Ambiguity, ambiguity_of
 from active6d_perception.scene.belief_weights import BeliefWeights, belief_path, load_belief
 from active6d_perception.scene.body_candidates import BodyCandidates, gather_candidates, merge_duplicates
 from active6d_perception.scene.body_refinement import BodyRefinement

@@ -8,7 +8,7 @@ from active6d_core.camera import PinholeCamera, pool_depth
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.se3 import invert, transform_points
 from active6d_perception.compiled import compiled
-from active6d_perception.scene.ambiguity import Ambiguity
+from active6d_perception.model.ambiguity import Ambiguity
 
 #: Length of the stored normals.
 NORMAL = 127

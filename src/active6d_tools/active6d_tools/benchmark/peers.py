@@ -17,7 +17,10 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, make_transform
 from active6d_perception.estimators.geometric.foreground import Surface, measure_surface
-from active6d_perception.estimators.refinement import claim_pixels, weigh_evidence
+from active6d_perception.estimators.masks import claim_pixels
+from active6d_perception.estimators.measured_image import measure_image
+from active6d_perception.estimators.pose_evidence import NEAR, OCCLUDED, VIOLATED, weigh_poses
+from active6d_perception.estimators.pose_selection import judge_of
 from active6d_perception.estimators.registry import Estimator
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
@@ -38,22 +41,21 @@ class DepthCheck:
             max_violated: largest share of it that the camera looked through.
         """
         self._model, self._min_fit, self._max_violated = model, min_fit, max_violated
-        self._views = model_views(model)
+        self._views, self._judge = model_views(model), judge_of(model, samples=512)
         self._distance = SymmetricDistance(model)
 
     def report(self, T_camera_object: np.ndarray, surface: Surface, view: View) -> Hypotheses:
         """The accepted ones of (k, 4, 4) candidates, without duplicates, scored by the share of surface that fits."""
-        evidence = weigh_evidence(
-            self._views, T_camera_object, surface.depth, surface.normals, view.camera, samples=512
-        )
-        open_to_view = np.maximum(1.0 - evidence.occluded, 1e-6)
+        evidence = weigh_poses(T_camera_object, self._judge, measure_image(view.depth, view.camera))
+        fitting, violated = evidence[:, NEAR], evidence[:, VIOLATED]
+        open_to_view = np.maximum(1.0 - evidence[:, OCCLUDED], 1e-6)
         accepted = np.flatnonzero(
-            (evidence.fitting >= self._min_fit * open_to_view)
-            & (evidence.violated <= self._max_violated * open_to_view)
-            & (evidence.fitting >= 0.1)
+            (fitting >= self._min_fit * open_to_view)
+            & (violated <= self._max_violated * open_to_view)
+            & (fitting >= 0.1)
         )
         poses = T_camera_object[accepted]
-        score = np.clip(evidence.fitting - evidence.violated, 0.0, 1.0)[accepted]
+        score = np.clip(fitting - violated, 0.0, 1.0)[accepted]
         kept = suppress(self._distance.between(poses, poses), score, 0.15 * self._model.diameter)
         poses, score = poses[kept], score[kept]
         label = claim_pixels(self._views, poses, surface.points, surface.foreground, view.camera)

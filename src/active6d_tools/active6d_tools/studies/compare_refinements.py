@@ -25,8 +25,9 @@ from active6d_perception.estimators.dense.decoding import decode
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
 from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera
-from active6d_perception.estimators.refinement import refine
+from active6d_perception.estimators.image_registration import register
 from active6d_perception.model.model_views import model_views
+from active6d_perception.model.visible_samples import visible_samples
 from active6d_tools.studies.arguments import read_arguments
 
 DEPLOYED: dict[str, Any] = {"gates": (0.008, 0.004), "iterations": 3, "samples": 192}
@@ -51,20 +52,23 @@ def directions(count: int, rng: np.random.Generator) -> np.ndarray:
 def main() -> None:
     model, trained, samples = read_arguments(__doc__, every=2)
     estimator, views, rng = DenseEstimator(model, trained), model_views(model), np.random.default_rng(0)
+    everything, counts = np.ones(len(views.points), bool), {how.get("samples", 192) for how in VARIANTS.values()}
+    samples_of = {count: visible_samples(views, everything, count, model.mesh.area) for count in counts}
     errors: dict[str, list[np.ndarray]] = {name: [] for name in VARIANTS}
     seconds = dict.fromkeys(VARIANTS, 0.0)
     for sample in track(samples):
         depth, camera = pool_depth(sample.view.depth, OUTPUT_STRIDE), output_camera(sample.view.camera)
         instances = decode(estimator.ask(sample.view), depth, camera, trained.canonical_frame, model.diameter)
-        surface = MeasuredSurface.of(sample.view, instances)
+        measured = MeasuredSurface.of(sample.view, instances).of_instances()
         true = sample.T_camera_object[sample.visible_fraction >= 0.1]
-        if surface.tree is None or not len(true):
+        if not len(instances) or not len(true):
             continue
         turn = Rotation.from_rotvec(ANGLE * directions(len(true), rng)).as_matrix()
         start = make_transform(true[:, :3, :3] @ turn, true[:, :3, 3] + DISTANCE * directions(len(true), rng))
         for name, own in VARIANTS.items():
             begun = process_time()
-            T = refine(views, start, surface.tree, surface.tree_normals, **{**DEPLOYED, **own})
+            how = {**DEPLOYED, **own}
+            T = register(start, samples_of[how["samples"]], measured, np.array(how["gates"]), how["iterations"])
             seconds[name] += process_time() - begun
             errors[name].append(e_add(model, T, true))
     table = Table("", "found at 10 %", "and at 5 %", "median ADD, mm", "ms per view")

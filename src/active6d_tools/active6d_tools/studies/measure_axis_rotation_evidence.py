@@ -16,13 +16,12 @@ from scipy.special import softmax
 from active6d_core.camera import pool_depth
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
-from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, CanonicalFrame, rotation_about_z
-from active6d_perception.estimators.dense.decoding import axis_rotation_probability, decode
+from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, CanonicalFrame
+from active6d_perception.estimators.dense.decoding import decode
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator
 from active6d_perception.estimators.dense.measured_surface import MeasuredSurface
 from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE, output_camera
-from active6d_perception.estimators.refinement import refine
-from active6d_perception.model.model_views import model_views
+from active6d_perception.estimators.dense.pose_search import PoseSearch
 from active6d_tools.studies.arguments import read_arguments
 
 SHAPE = 7, 4
@@ -37,11 +36,9 @@ def count(
     depth = pool_depth(view.depth, OUTPUT_STRIDE)
     instances = decode(estimator.ask(view), depth, output_camera(view.camera), canonical_frame, model.diameter)
     surface = MeasuredSurface.of(view, instances)
-    if surface.tree is None or not len(sample.T_camera_object):
+    if not len(instances) or not len(sample.T_camera_object):
         return np.zeros((0, len(AXIS_ANGLES), SHAPE[0] * SHAPE[1])), np.zeros(0)
-    T = instances.T_camera_axis
-    T = T @ rotation_about_z(AXIS_ANGLES[axis_rotation_probability(T, instances.direction).argmax(axis=1)])
-    T = refine(model_views(model), canonical_frame.object_pose(T), surface.tree, surface.tree_normals, gates=(0.008,))
+    T = PoseSearch(model, canonical_frame).poses(instances, surface)
     T = T @ canonical_frame.T_object_axis
     true = canonical_frame.axis_pose(sample.T_camera_object)
     distance = np.linalg.norm(T[:, None, :3, 3] - true[:, :3, 3], axis=-1)

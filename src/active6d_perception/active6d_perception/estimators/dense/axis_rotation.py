@@ -36,6 +36,8 @@ _FACING_ELSEWHERE, _FITTING = 2, 6
 # Errors of neighbouring pixels are correlated: each pixel counts as this share of an independent observation.
 _INDEPENDENT = 0.03
 _ON_BODY = 0.004  # metres
+# Rotations about the axis this close to the chosen one count towards its certainty.
+_SAME_ROTATION = np.radians(30.0)
 _CELL = 0.001  # metres, of the body's profile
 
 
@@ -117,6 +119,26 @@ class AxisRotationSearch:
         on_body = np.zeros(owner.size, bool)
         on_body[pixel] = self._body[cell[:, 0], cell[:, 1]]
         return on_body
+
+
+def likely_axis_rotations(probability: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The most likely rotations of each instance about its axis, at least 30 degrees apart.
+
+    Args:
+        probability: (n, len(AXIS_ANGLES)) rows that sum to 1.
+        count: number of rotations per instance.
+
+    Returns:
+        (n, count) indices into :data:`AXIS_ANGLES`, and (n, count) the probability within 30 degrees of each.
+    """
+    chosen, certainty = [], []
+    for _ in range(count):
+        best = probability.argmax(axis=1)
+        near = np.abs((AXIS_ANGLES - AXIS_ANGLES[best][:, None] + np.pi) % (2 * np.pi) - np.pi) < _SAME_ROTATION
+        chosen.append(best)
+        certainty.append((probability * near).sum(axis=1))
+        probability = np.where(near, 0.0, probability)
+    return np.stack(chosen, axis=1), np.stack(certainty, axis=1)
 
 
 def _profile(points: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from scipy.special import softmax
 from active6d_core.camera import View, pool_depth
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
-from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch
+from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch, likely_axis_rotations
 from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, AxisRotation, rotation_about_z
 from active6d_perception.estimators.dense.decoding import (
     DecodingParameters,
@@ -31,32 +31,31 @@ from active6d_perception.estimators.dense.network_input import (
     reduce_view,
     reduction,
 )
-from active6d_perception.estimators.dense.orientation_search import OrientationSearch
+from active6d_perception.estimators.dense.pose_search import COMPARED_POINTS, PoseSearch
 from active6d_perception.estimators.dense.trained_network import SCORE_FEATURES, TrainedNetwork, load_network
-from active6d_perception.estimators.refinement import claim_pixels, refine, weigh_evidence
+from active6d_perception.estimators.masks import claim_pixels
+from active6d_perception.estimators.measured_image import MeasuredImage, measure_image
+from active6d_perception.estimators.pose_selection import judge_of, pose_features
 from active6d_perception.estimators.registry import register_estimator, weights_path
 from active6d_perception.estimators.score_model import ScoreModel
 from active6d_perception.model.model_views import model_views
+from active6d_perception.model.surface_grid import surface_grid
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.suppression import suppress
 
 _Result = TypeVar("_Result")
 
-# Rotations about the axis this close to the chosen one count towards its certainty.
-_SAME_ROTATION = np.radians(30.0)
-# Rounds of (orientations refined per instance, gates in metres), where the whole surface shows the orientation. The
-# second round takes the best of the first, with smaller gates. Votes for centres of slivers are 20 mm off.
-_TRIED_ORIENTATIONS = ((20, (0.02,)), (12, (0.012, 0.008)))
 # A further rotation of an instance about its axis is reported only if it is at least this likely.
 _LEAST_CERTAINTY = 0.1
 # Exponent of the network's distribution of the rotation, relative to the likelihood of the depth image.
 _NETWORK_TRUST = 0.6
-_GATES = (0.008, 0.004)  # metres, of refinement
-_ITERATIONS = 3  # of refinement with each gate; more change nothing on the validation views
-_SAMPLES = 192  # of the model's surface, in refinement
+# Width of the images that poses are judged by, pixels; more detail is in the noise of today's sensors.
+_DETAIL_WIDTH = 640
 # The probability that an instance is there and its body is right, for networks whose score was not fitted. Fitted ones
 # have their regression beside the weights (active6d_tools.score_fitting).
-_UNFITTED_SCORE = ScoreModel(SCORE_FEATURES, np.array([14.0, -14.0, 0.0, 0.0]), -0.8)
+_UNFITTED_SCORE = ScoreModel(
+    SCORE_FEATURES, np.array([{"fitting": 14.0, "violated": -14.0}.get(name, 0.0) for name in SCORE_FEATURES]), -0.8
+)
 
 
 @dataclass(frozen=True)
@@ -108,26 +107,6 @@ class Poses:
         return Poses(*(getattr(self, item.name)[index] for item in fields(self)))
 
 
-def likely_axis_rotations(probability: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The most likely rotations of each instance about its axis, at least 30 degrees apart.
-
-    Args:
-        probability: (n, len(AXIS_ANGLES)) rows that sum to 1.
-        count: number of rotations per instance.
-
-    Returns:
-        (n, count) indices into :data:`AXIS_ANGLES`, and (n, count) the probability within 30 degrees of each.
-    """
-    chosen, certainty = [], []
-    for _ in range(count):
-        best = probability.argmax(axis=1)
-        near = np.abs((AXIS_ANGLES - AXIS_ANGLES[best][:, None] + np.pi) % (2 * np.pi) - np.pi) < _SAME_ROTATION
-        chosen.append(best)
-        certainty.append((probability * near).sum(axis=1))
-        probability = np.where(near, 0.0, probability)
-    return np.stack(chosen, axis=1), np.stack(certainty, axis=1)
-
-
 class DenseEstimator:
     """Estimates poses by a network, votes for centres, visible-surface ICP, and scores from the depth image.
 
@@ -149,14 +128,14 @@ class DenseEstimator:
         self._distance = SymmetricDistance(model)
         shown = trained.canonical_frame.axis_rotation
         by_feature = shown is AxisRotation.SHOWN_BY_FEATURE
+        self._search = PoseSearch(model, trained.canonical_frame)
+        self._judge, self._grid = judge_of(model), surface_grid(model)
         self._axis_rotations = AxisRotationSearch(model, trained.canonical_frame) if by_feature else None
-        self._orientations = OrientationSearch(model) if shown is AxisRotation.VISIBLE else None
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimators.registry.Estimator.estimate`."""
         self.stage_ms = {}
-        reduced = self._timed("input", reduce_view, view)
-        poses, label = self.locate(reduced)
+        poses, label = self.locate(view)
         self.certainty = poses.certainty
         if not len(poses.score):
             return Hypotheses.empty(view.camera.height, view.camera.width)
@@ -175,30 +154,43 @@ class DenseEstimator:
         )
 
     def locate(self, view: View) -> tuple[Poses, np.ndarray]:
-        """Find poses in a view at the network's resolution, see :func:`.reduce_view`.
+        """Find poses in a view.
 
         Returns:
-            The poses, best first, and the (h, w) uint16 label image: 1 + ``Poses.instance``, 0 for none.
+            The poses, best first, and the label image: 1 + ``Poses.instance``, 0 for none. It is (h, w) uint16 at the
+            network's resolution, see :func:`.reduce_view`.
         """
-        answer = self._timed("network", self.ask, view)
-        depth = pool_depth(view.depth, OUTPUT_STRIDE)
+        instances, surface = self._measure(view)
+        if not len(instances):
+            nothing, features = np.zeros(0), np.zeros((0, len(SCORE_FEATURES)))
+            poses = Poses(np.zeros((0, 4, 4)), nothing, nothing.astype(int), nothing, features)
+            return poses, np.zeros(surface.depth.shape, np.uint16)
+        candidates = self._timed("poses", self._find_poses, instances, surface)
+        return self._timed("judging", self._judge_poses, *candidates, surface)
+
+    def compare(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """The candidates between which the poses of the n instances are selected, see :meth:`.PoseSearch.compare`.
+
+        Returns:
+            (n, c, 4, 4) ``T_camera_object``, metres, and (n, c, f) their :data:`.FEATURES`.
+        """
+        return self._search.compare(*self._measure(view))
+
+    def _measure(self, view: View) -> tuple[Instances, MeasuredSurface]:
+        reduced = self._timed("input", reduce_view, view)
+        answer = self._timed("network", self.ask, reduced)
         instances = self._timed(
             "decoding",
             decode,
             answer,
-            depth,
-            output_camera(view.camera),
+            pool_depth(reduced.depth, OUTPUT_STRIDE),
+            output_camera(reduced.camera),
             self._trained.canonical_frame,
             self.model.diameter,
             self.parameters.decoding,
         )
-        if not len(instances):
-            nothing, features = np.zeros(0), np.zeros((0, len(SCORE_FEATURES)))
-            poses = Poses(np.zeros((0, 4, 4)), nothing, nothing.astype(int), nothing, features)
-            return poses, np.zeros(view.depth.shape, np.uint16)
-        surface = self._timed("surface", MeasuredSurface.of, view, instances)
-        candidates = self._timed("poses", self._find_poses, instances, surface)
-        return self._timed("judging", self._judge, *candidates, surface)
+        detail = self._timed("detail", _measure_detail, view)
+        return instances, self._timed("surface", MeasuredSurface.of, reduced, instances, detail)
 
     def ask(self, view: View) -> np.ndarray:
         """(channels, h, w) output of the network for a view at its resolution; channels last in memory."""
@@ -211,75 +203,30 @@ class DenseEstimator:
 
     def _find_poses(self, instances: Instances, surface: MeasuredSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(k, 4, 4) refined ``T_camera_object``, and (k,) instance and certainty of each, likely ones first."""
-        canonical_frame, T = self._trained.canonical_frame, instances.T_camera_axis
-        if canonical_frame.axis_rotation is AxisRotation.INVISIBLE:
-            return self._refined(canonical_frame.object_pose(T), surface, _GATES), np.arange(len(T)), np.ones(len(T))
-        if canonical_frame.axis_rotation is AxisRotation.VISIBLE:
-            return self._best_fitting_orientations(instances, surface)
-        # The network's estimate of the rotation serves to refine the axis, and the axis to find the rotation.
-        probability = axis_rotation_probability(T, instances.direction)
-        T = T @ rotation_about_z(AXIS_ANGLES[probability.argmax(axis=1)])
-        T = self._refined(canonical_frame.object_pose(T), surface, _GATES[:1]) @ canonical_frame.T_object_axis
-        chosen, certainty = likely_axis_rotations(
-            self._axis_rotation_probability(T, instances, surface), self.parameters.alternatives
-        )
-        instance, rank = np.nonzero((np.arange(chosen.shape[1]) == 0) | (certainty > _LEAST_CERTAINTY))
-        T = canonical_frame.object_pose(T[instance] @ rotation_about_z(AXIS_ANGLES[chosen[instance, rank]]))
-        return self._refined(T, surface, _GATES[1:]), instance, certainty[instance, rank]
-
-    def _best_fitting_orientations(
-        self, instances: Instances, surface: MeasuredSurface
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As :meth:`_find_poses`, where the whole surface shows the orientation: the best fitting of several."""
-        count = len(instances)
-        assert self._orientations is not None, "made where the whole surface shows the orientation"
-        T = self._orientations.candidates(instances, surface, _TRIED_ORIENTATIONS[0][0])
-        for number, gates in _TRIED_ORIENTATIONS:
-            T = self._refined(T[:, :number].reshape(-1, 4, 4), surface, gates, iterations=2, samples=64)
-            fit = self._fit(T, surface).reshape(count, number)
-            best_first = np.argsort(-fit, axis=1, kind="stable")
-            T = np.take_along_axis(T.reshape(count, number, 4, 4), best_first[..., None, None], axis=1)
-        return self._refined(T[:, 0], surface, _GATES[1:]), np.arange(count), np.ones(count)
-
-    def _axis_rotation_probability(self, T: np.ndarray, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
-        """(n, len(AXIS_ANGLES)) posterior of the rotation about the axis, from network and depth image."""
-        assert self._axis_rotations is not None, "made where a part shows the rotation"
+        canonical_frame = self._trained.canonical_frame
+        if self.parameters.refined:
+            T = self._search.poses(instances, surface)
+        else:
+            T = canonical_frame.object_pose(instances.T_camera_axis)
+        if self._axis_rotations is None:
+            return T, np.arange(len(T)), np.ones(len(T))
+        T = T @ canonical_frame.T_object_axis
         measured = self._axis_rotations.log_likelihood(T, surface)
         predicted = _NETWORK_TRUST * np.log(axis_rotation_probability(T, instances.direction) + 1e-6)
-        return softmax(measured + predicted, axis=1)
+        chosen, certainty = likely_axis_rotations(softmax(measured + predicted, axis=1), self.parameters.alternatives)
+        instance, rank = np.nonzero((np.arange(chosen.shape[1]) == 0) | (certainty > _LEAST_CERTAINTY))
+        T = canonical_frame.object_pose(T[instance] @ rotation_about_z(AXIS_ANGLES[chosen[instance, rank]]))
+        T = self._search.refine(T, surface) if self.parameters.refined else T
+        return T, instance, certainty[instance, rank]
 
-    def _refined(
-        self,
-        T: np.ndarray,
-        surface: MeasuredSurface,
-        gates: tuple[float, ...],
-        iterations: int = _ITERATIONS,
-        samples: int = _SAMPLES,
-    ) -> np.ndarray:
-        if not self.parameters.refined or surface.tree is None:
-            return T
-        return refine(
-            self._views, T, surface.tree, surface.tree_normals, gates=gates, iterations=iterations, samples=samples
-        )
-
-    def _fit(self, T_camera_object: np.ndarray, surface: MeasuredSurface) -> np.ndarray:
-        """(k,) share of each pose's visible surface that is measured there, less the share that is looked through."""
-        evidence = weigh_evidence(self._views, T_camera_object, surface.depth, surface.normals, surface.camera)
-        return evidence.fitting - evidence.violated
-
-    def _judge(
+    def _judge_poses(
         self, T_camera_object: np.ndarray, instance: np.ndarray, certainty: np.ndarray, surface: MeasuredSurface
     ) -> tuple[Poses, np.ndarray]:
-        evidence = weigh_evidence(self._views, T_camera_object, surface.depth, surface.normals, surface.camera)
         pixels = np.bincount(surface.owner[surface.owner >= 0], minlength=instance.max(initial=0) + 1)[instance]
-        features = np.column_stack(
-            [
-                evidence.fitting,
-                evidence.violated,
-                evidence.fitting / np.maximum(1.0 - evidence.occluded, 0.1),
-                np.log(np.maximum(pixels, 1)),
-            ]
-        )
+        points, normals, number = surface.points_of_instances(COMPARED_POINTS)
+        of_instances = points[instance], normals[instance], number[instance]
+        compared = pose_features(T_camera_object[:, None], self._judge, self._grid, surface.detail, of_instances)
+        features = np.column_stack([compared[:, 0], np.log(np.maximum(pixels, 1))])
         presence = (self._trained.score or _UNFITTED_SCORE).probability(features)
         return self._report(Poses(T_camera_object, presence * certainty, instance, certainty, features), surface)
 
@@ -320,6 +267,11 @@ class DenseEstimator:
         result = function(*arguments)
         self.stage_ms[stage] = 1e3 * (perf_counter() - start)
         return result
+
+
+def _measure_detail(view: View) -> MeasuredImage:
+    factor = max(1, round(view.camera.width / _DETAIL_WIDTH))
+    return measure_image(pool_depth(view.depth, factor), view.camera.reduced(factor))
 
 
 @register_estimator("dense")

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from active6d_core.camera import PinholeCamera, View, backproject, normals_from_points
-from active6d_perception.estimators.dense.decoding import Instances
+from active6d_perception.estimators.dense.decoding import Instances, member_table
 from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE
+from active6d_perception.estimators.measured_image import MeasuredImage, measure_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,8 +20,8 @@ class MeasuredSurface:
         normals: (h, w, 3) facing the camera, NaN unknown.
         owner: (h, w) index of the pixel's instance, -1 without an instance or without depth.
         camera: intrinsics.
-        tree: search tree over the instances' points that have normals; None if there are too few.
-        tree_normals: (p, 3) of the tree's points.
+        detail: the whole view at its own resolution, or a multiple of the network's where it is finer.
+        instances: number of instances.
     """
 
     depth: np.ndarray
@@ -29,12 +29,18 @@ class MeasuredSurface:
     normals: np.ndarray
     owner: np.ndarray
     camera: PinholeCamera
-    tree: cKDTree | None
-    tree_normals: np.ndarray
+    detail: MeasuredImage
+    instances: int
 
     @classmethod
-    def of(cls, view: View, instances: Instances) -> "MeasuredSurface":
-        """The surface of a view at the network's resolution in which ``instances`` were found."""
+    def of(cls, view: View, instances: Instances, detail: MeasuredImage | None = None) -> "MeasuredSurface":
+        """The surface of a view at the network's resolution in which ``instances`` were found.
+
+        Args:
+            view: at the network's resolution.
+            instances: found in it.
+            detail: see the attribute; None where there is only ``view``.
+        """
         # Reduced depth is already a mean of pixels. More smoothing would round edges off and let poses slide.
         points = backproject(view.depth, view.camera)
         normals = normals_from_points(points, reach=1)
@@ -45,6 +51,35 @@ class MeasuredSurface:
         owner = np.full((height, width), -1)
         owner[: enlarged.shape[0], : enlarged.shape[1]] = enlarged
         owner[np.isnan(view.depth)] = -1
-        usable = (owner >= 0) & np.isfinite(normals).all(axis=-1)
-        tree = cKDTree(points[usable]) if np.count_nonzero(usable) > 6 else None
-        return cls(view.depth, points, normals, owner, view.camera, tree, normals[usable])
+        return cls(
+            view.depth,
+            points,
+            normals,
+            owner,
+            view.camera,
+            detail or measure_image(view.depth, view.camera),
+            len(instances),
+        )
+
+    def of_instances(self) -> MeasuredImage:
+        """The points of the instances, for registration; other pixels are NaN."""
+        usable = (self.owner >= 0) & np.isfinite(self.normals).all(axis=-1)
+        points = np.where(usable[..., None], self.points, np.float32(np.nan))
+        intrinsics = self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
+        return MeasuredImage(points, np.ascontiguousarray(self.normals), *map(float, intrinsics))
+
+    def points_of_instances(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Evenly spaced points of each instance.
+
+        Args:
+            count: largest number of points of an instance.
+
+        Returns:
+            (n, count, 3) float32 points in the optical frame, metres; (n, count, 3) float32 unit normals; and (n,) the
+            number of points that each instance has.
+        """
+        normals = self.normals.reshape(-1, 3)
+        pixel = np.flatnonzero((self.owner.ravel() >= 0) & np.isfinite(normals).all(axis=1))
+        table, used = member_table(self.owner.ravel()[pixel], self.instances, count)
+        pixel = pixel[table] if len(pixel) else table
+        return self.points.reshape(-1, 3)[pixel], normals[pixel], used.sum(axis=1)

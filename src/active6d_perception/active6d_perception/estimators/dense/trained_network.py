@@ -15,15 +15,16 @@ from active6d_core.structured_text import read_json
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
 from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize
 from active6d_perception.estimators.dense.network_input import CHANNELS
+from active6d_perception.estimators.pose_selection import FEATURES
 from active6d_perception.estimators.score_model import ScoreModel
 from active6d_perception.tensor_file import load_module
 
 _FORMAT = 1
-#: Regressors of the score: shares of the visible surface that fit, that are looked through, and that fit of what is not
-#: occluded; and the logarithm of the number of the instance's pixels at the network's resolution.
-SCORE_FEATURES = ("fitting", "violated", "fitting_unoccluded", "log_pixels")
+#: Regressors of the score: what poses are compared by, and the logarithm of the number of the instance's pixels at the
+#: network's resolution.
+SCORE_FEATURES = (*FEATURES, "log_pixels")
 #: Features that can only lower it.
-SCORE_LOWERED_BY = ("violated",)
+SCORE_LOWERED_BY = ("violated", "violated_comparable", "continued")
 
 
 @dataclass(frozen=True, eq=False)

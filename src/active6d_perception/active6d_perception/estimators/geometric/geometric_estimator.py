@@ -20,7 +20,7 @@ from active6d_perception.estimators.geometric.multi_start import (
     thin_out,
 )
 from active6d_perception.estimators.geometric.pair_voting import PairVoting
-from active6d_perception.estimators.refinement import claim_pixels
+from active6d_perception.estimators.masks import claim_pixels
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.estimators.score_model import ScoreModel
 from active6d_perception.model.model_views import model_views

@@ -13,9 +13,9 @@ from active6d_core.object_model import ObjectModel, Symmetry
 from active6d_core.se3 import transform_points
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.near_symmetry import near_symmetries, telling_surface
+from active6d_perception.model.solid import Solid, solid_of
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.model.visible_samples import VisibleSamples, visible_samples
-from active6d_perception.scene.solid import Solid, solid_of
 
 # Rotations about an axis of near symmetry, 10 degrees apart.
 _ROTATIONS = 36
