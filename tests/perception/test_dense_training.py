@@ -15,11 +15,12 @@ from active6d_core.se3 import invert, look_at, make_transform, transform_points
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, canonical_frame_of
 from active6d_perception.estimators.dense.decoding import DecodingParameters
-from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
+from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters, log_odds
 from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize, split
 from active6d_perception.estimators.dense.network_input import output_camera, ray_frames, ray_rotation, reduction
 from active6d_perception.estimators.dense.sphere_bins import CENTRES
 from active6d_perception.estimators.dense.trained_network import (
+    CERTAINTY_FEATURES,
     SCORE_FEATURES,
     TrainedNetwork,
     load_network,
@@ -437,6 +438,10 @@ def test_a_fitted_score_is_kept_beside_the_weights(tmp_path, trained):
     log_odds = sum(float(weight * feature) for weight, feature in zip(weights, features, strict=True)) - 4.0
     score = load_network(path, model).score
     assert score.probability(features) == pytest.approx(1 / (1 + np.exp(-log_odds)), rel=1e-3)
+    assert load_network(path, model).certainty is None
+    save_score(path, ScoreModel(SCORE_FEATURES, weights, -4.0), ScoreModel(CERTAINTY_FEATURES, np.array([0.5]), -1.0))
+    certainty = load_network(path, model).certainty
+    assert certainty.probability(log_odds(np.array([0.9]))[:, None]) == pytest.approx(3 / (3 + np.e))
     save_score(path, ScoreModel(("other",), np.ones(1), 0.0))
     with pytest.raises(ValueError, match="not a score model: it is for the features other"):
         load_network(path, model)

@@ -1,7 +1,7 @@
 """Fitting of an estimator's score: what it says of poses in validation views, and whether they are right."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,10 @@ from active6d_core.metrics import DETECTION_FRACTION, add_s, e_add, match
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters
+from active6d_perception.estimators.dense.canonical_frame import AxisRotation
+from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters, log_odds
 from active6d_perception.estimators.dense.trained_network import (
+    CERTAINTY_FEATURES,
     SCORE_FEATURES,
     SCORE_LOWERED_BY,
     load_network,
@@ -24,6 +26,8 @@ from active6d_sim.scenes.scene_store import SPLITS, load_scene
 from active6d_tools.benchmark.grid_views import GridViews
 from active6d_tools.training_data import VALIDATION_SPLITS
 
+#: From a model, estimated and true poses to errors in metres, see :mod:`active6d_core.metrics`.
+ErrorMeasure = Callable[[ObjectModel, np.ndarray, np.ndarray], np.ndarray]
 #: From a view to (k, 4, 4) ``T_camera_object`` and their (k, f) features.
 Judge = Callable[[View], tuple[np.ndarray, np.ndarray]]
 
@@ -36,12 +40,14 @@ class JudgedPoses:
         features: (k, f) as the estimator computes them.
         right: (k,) bool, whether each is the best match of a true object, within 10 % of the diameter. An object with a
             part that can be hidden counts by ADD-S, as no view may show how it is turned.
+        exact: (k,) bool, the same by ADD for every object.
         split: (k,) index into :data:`.VALIDATION_SPLITS`.
         group: (k,) number of the scene.
     """
 
     features: np.ndarray
     right: np.ndarray
+    exact: np.ndarray
     split: np.ndarray
     group: np.ndarray
 
@@ -70,15 +76,21 @@ def fit_dense_score(
     Returns:
         Calibration error and precision at score .5 by split, on the views that it was fitted on.
     """
-    estimator = DenseEstimator(model, load_network(weights, model), DenseParameters(min_score=0.0))
+    uncalibrated = replace(load_network(weights, model), certainty=None)
+    estimator = DenseEstimator(model, uncalibrated, DenseParameters(min_score=0.0))
 
     def judge(view: View) -> tuple[np.ndarray, np.ndarray]:
         poses, _ = estimator.locate(view)
-        return poses.T_camera_object, poses.features
+        return poses.T_camera_object, np.column_stack([poses.features, log_odds(poses.certainty)])
 
     poses = judge_validation_views(model, judge, views, rng, on_progress)
+    poses, rotation = replace(poses, features=poses.features[:, :-1]), poses.features[:, -1:]
     score = ScoreModel.fit(SCORE_FEATURES, poses.features, poses.right, poses.weight, against=SCORE_LOWERED_BY)
-    save_score(weights, score)
+    certainty = None
+    if uncalibrated.canonical_frame.axis_rotation is AxisRotation.SHOWN_BY_FEATURE:
+        body, weight = poses.right, poses.weight
+        certainty = ScoreModel.fit(CERTAINTY_FEATURES, rotation[body], poses.exact[body], weight[body])
+    save_score(weights, score, certainty)
     return summarise_score(score, poses)
 
 
@@ -111,7 +123,7 @@ def judge_validation_views(
         rng: random generator of the views.
         on_progress: called with the number of scenes done and of all scenes.
     """
-    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+    parts: list[tuple[np.ndarray, ...]] = []
     total = sum(SPLITS[split] for split in VALIDATION_SPLITS)
     done = 0
     for number, split in enumerate(VALIDATION_SPLITS):
@@ -121,19 +133,26 @@ def judge_validation_views(
             for view in rng.choice(len(ViewSphere()), views, replace=False):
                 labelled = grid.capture(index, int(view), 1.0)
                 T, features = judge(labelled.view)
-                right = is_right(model, T, invert(labelled.view.T_world_camera) @ labelled.T_world_object)
-                parts.append((features, right, np.full(len(T), number), np.full(len(T), done)))
+                true = invert(labelled.view.T_world_camera) @ labelled.T_world_object
+                right, exact = (is_right(model, T, true, measure) for measure in (error_measure(model), e_add))
+                parts.append((features, right, exact, np.full(len(T), number), np.full(len(T), done)))
             done += 1
             on_progress(done, total)
     return JudgedPoses(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def is_right(model: ObjectModel, T_camera_object: np.ndarray, T_camera_true: np.ndarray) -> np.ndarray:
-    """(k,) whether each of (k, 4, 4) poses is the match of one of (n, 4, 4) true ones; see :class:`JudgedPoses`."""
+def error_measure(model: ObjectModel) -> ErrorMeasure:
+    """ADD-S for an object with a part that can be hidden, as no view may show how it is turned; ADD for others."""
+    return add_s if model.features else e_add
+
+
+def is_right(
+    model: ObjectModel, T_camera_object: np.ndarray, T_camera_true: np.ndarray, measure: ErrorMeasure
+) -> np.ndarray:
+    """(k,) whether each of (k, 4, 4) poses is the match of one of (n, 4, 4) true ones, within 10 % of the diameter."""
     limit = DETECTION_FRACTION * model.diameter
     errors = np.full((len(T_camera_object), len(T_camera_true)), np.inf)
     apart = np.linalg.norm(T_camera_object[:, None, :3, 3] - T_camera_true[None, :, :3, 3], axis=-1)
-    measure = add_s if model.features else e_add
     for pose, other in zip(*np.nonzero(apart < 0.5 * model.diameter), strict=True):
         errors[pose, other] = measure(model, T_camera_object[pose], T_camera_true[other])
     matched = match(errors, limit)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from scipy.special import softmax
+from scipy.special import logit, softmax
 
 from active6d_core.camera import View, pool_depth
 from active6d_core.hypotheses import Hypotheses
@@ -92,7 +92,7 @@ class Poses:
         T_camera_object: (k, 4, 4) poses in the optical frame, metres.
         score: (k,) probability that the pose is right: that the instance is there, times the certainty.
         instance: (k,) index of the instance; several poses of one instance are alternatives.
-        certainty: (k,) posterior probability of the rotation about the axis, 1 where it is not ambiguous.
+        certainty: (k,) probability of the rotation about the axis if the body is right, 1 where it is not ambiguous.
         features: (k, f) regressors of the probability that the instance is there, :data:`.SCORE_FEATURES`.
     """
 
@@ -227,6 +227,8 @@ class DenseEstimator:
         of_instances = points[instance], normals[instance], number[instance]
         compared = pose_features(T_camera_object[:, None], self._judge, self._grid, surface.detail, of_instances)
         features = np.column_stack([compared[:, 0], np.log(np.maximum(pixels, 1))])
+        if self._axis_rotations is not None and self._trained.certainty is not None:
+            certainty = self._trained.certainty.probability(log_odds(certainty)[:, None])
         presence = (self._trained.score or _UNFITTED_SCORE).probability(features)
         return self._report(Poses(T_camera_object, presence * certainty, instance, certainty, features), surface)
 
@@ -267,6 +269,11 @@ class DenseEstimator:
         result = function(*arguments)
         self.stage_ms[stage] = 1e3 * (perf_counter() - start)
         return result
+
+
+def log_odds(probability: np.ndarray) -> np.ndarray:
+    """Log-odds of probabilities, which are kept a millionth away from 0 and 1."""
+    return np.asarray(logit(np.clip(probability, 1e-6, 1 - 1e-6)))
 
 
 def _measure_detail(view: View) -> MeasuredImage:

@@ -23,7 +23,9 @@ _FORMAT = 1
 #: Regressors of the score: what poses are compared by, and the logarithm of the number of the instance's pixels at the
 #: network's resolution.
 SCORE_FEATURES = (*FEATURES, "log_pixels")
-#: Features that can only lower it.
+#: Regressor of the certainty.
+CERTAINTY_FEATURES = ("log_odds",)
+#: Features that can only lower the score.
 SCORE_LOWERED_BY = ("violated", "violated_comparable", "continued")
 
 
@@ -39,6 +41,8 @@ class TrainedNetwork:
         size: channels of the network's layers.
         training: options and validation results of the training; kept for information only.
         score: from features of a pose to the probability that it is right; None if it was not fitted.
+        certainty: from the log-odds of the rotation's posterior probability to the probability that the rotation is
+            right where the body is; None if it was not fitted.
     """
 
     network: DenseNetwork
@@ -48,6 +52,7 @@ class TrainedNetwork:
     size: NetworkSize
     training: dict[str, Any] = field(default_factory=dict)
     score: ScoreModel | None = None
+    certainty: ScoreModel | None = None
 
 
 def save_network(path: Path, trained: TrainedNetwork) -> None:
@@ -73,11 +78,13 @@ def save_network(path: Path, trained: TrainedNetwork) -> None:
     write_file(path.with_suffix(".json"), json.dumps(description, indent=1) + "\n")
 
 
-def save_score(path: Path, score: ScoreModel) -> None:
-    """Write a fitted score into the JSON file beside the weights ``path``."""
+def save_score(path: Path, score: ScoreModel, certainty: ScoreModel | None = None) -> None:
+    """Write a fitted score, and the certainty where it was fitted, into the JSON file beside the weights ``path``."""
     described = path.with_suffix(".json")
-    description = json.loads(described.read_text())
-    write_file(described, json.dumps({**description, "score": score.as_dict()}, indent=1) + "\n")
+    description = json.loads(described.read_text()) | {"score": score.as_dict()}
+    if certainty is not None:
+        description["certainty"] = certainty.as_dict()
+    write_file(described, json.dumps(description, indent=1) + "\n")
 
 
 def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
@@ -96,7 +103,11 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
         if not is_rigid(canonical_frame.T_object_axis, 1e-5):
             raise ValueError("T_object_axis is not a rigid transform")
         heads = HEADS if description["heads"] == HEADS else DEPLOYED_HEADS
-        score = ScoreModel.from_dict(description["score"], SCORE_FEATURES) if "score" in description else None
+        fitted = {"score": SCORE_FEATURES, "certainty": CERTAINTY_FEATURES}
+        score, certainty = (
+            ScoreModel.from_dict(description[name], features) if name in description else None
+            for name, features in fitted.items()
+        )
     # A wrong value fails in whichever library meets it first.
     except Exception as error:
         raise ValueError(f"{path.with_suffix('.json')}: bad description of a network ({error})") from error
@@ -108,7 +119,7 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
             f"{path}: damaged, or not the weights that its .json describes ({reason}); {_advice(model)}"
         ) from error
     training = description.get("training") or {}
-    return TrainedNetwork(network.eval(), canonical_frame, model.name, model.diameter, size, training, score)
+    return TrainedNetwork(network.eval(), canonical_frame, model.name, model.diameter, size, training, score, certainty)
 
 
 def _read_description(path: Path, model: ObjectModel) -> dict[str, Any]:
