@@ -435,13 +435,13 @@ def test_a_fitted_score_is_kept_beside_the_weights(tmp_path, trained):
     assert load_network(path, model).score is None
     weights, features = np.linspace(-2.0, 3.0, len(SCORE_FEATURES)), np.linspace(0.0, 1.0, len(SCORE_FEATURES))
     save_score(path, ScoreModel(SCORE_FEATURES, weights, -4.0))
-    log_odds = sum(float(weight * feature) for weight, feature in zip(weights, features, strict=True)) - 4.0
+    expected = sum(float(weight * feature) for weight, feature in zip(weights, features, strict=True)) - 4.0
     score = load_network(path, model).score
-    assert score.probability(features) == pytest.approx(1 / (1 + np.exp(-log_odds)), rel=1e-3)
+    assert score.probability(features) == pytest.approx(1 / (1 + np.exp(-expected)), rel=1e-3)
     assert load_network(path, model).certainty is None
     save_score(path, ScoreModel(SCORE_FEATURES, weights, -4.0), ScoreModel(CERTAINTY_FEATURES, np.array([0.5]), -1.0))
     certainty = load_network(path, model).certainty
-    assert certainty.probability(log_odds(np.array([0.9]))[:, None]) == pytest.approx(3 / (3 + np.e))
+    assert certainty.probability(log_odds(np.array([0.9]))[:, None])[0] == pytest.approx(3 / (3 + np.e))
     save_score(path, ScoreModel(("other",), np.ones(1), 0.0))
     with pytest.raises(ValueError, match="not a score model: it is for the features other"):
         load_network(path, model)

@@ -209,15 +209,17 @@ class DenseEstimator:
         else:
             T = canonical_frame.object_pose(instances.T_camera_axis)
         if self._axis_rotations is None:
-            return T, np.arange(len(T)), np.ones(len(T))
+            return self._refined(T, surface), np.arange(len(T)), np.ones(len(T))
         T = T @ canonical_frame.T_object_axis
         measured = self._axis_rotations.log_likelihood(T, surface)
         predicted = _NETWORK_TRUST * np.log(axis_rotation_probability(T, instances.direction) + 1e-6)
         chosen, certainty = likely_axis_rotations(softmax(measured + predicted, axis=1), self.parameters.alternatives)
         instance, rank = np.nonzero((np.arange(chosen.shape[1]) == 0) | (certainty > _LEAST_CERTAINTY))
         T = canonical_frame.object_pose(T[instance] @ rotation_about_z(AXIS_ANGLES[chosen[instance, rank]]))
-        T = self._search.refine(T, surface) if self.parameters.refined else T
-        return T, instance, certainty[instance, rank]
+        return self._refined(T, surface), instance, certainty[instance, rank]
+
+    def _refined(self, T_camera_object: np.ndarray, surface: MeasuredSurface) -> np.ndarray:
+        return self._search.refine(T_camera_object, surface) if self.parameters.refined else T_camera_object
 
     def _judge_poses(
         self, T_camera_object: np.ndarray, instance: np.ndarray, certainty: np.ndarray, surface: MeasuredSurface

@@ -29,9 +29,9 @@ from active6d_perception.model.visible_samples import VisibleSamples, visible_sa
 COMPARED_POINTS = 64
 # Orientations of the coarse search per instance. Where the whole surface shows the orientation, there are more of them.
 _SEARCHED, _SEARCHED_ALL = 6, 16
-# Candidates per instance that are registered with all samples, the best after a first registration with few.
+# Candidates per instance that are registered with many samples, the best after a first registration with few.
 _KEPT = 3
-_FEW, _MANY = 64, 192
+_FEW, _MANY, _MOST = 64, 192, 384
 # Largest distances of pairs in the stages of both, metres. Votes for centres of slivers are 20 mm off.
 _ROUGH, _FINE, _FINEST = (0.02, 0.008), (0.008, 0.004), (0.004,)
 _ITERATIONS = 3  # for each distance; more change nothing on the validation views
@@ -49,7 +49,7 @@ class PoseSearch:
         body = ~ambiguity.telling
         self._selection = PoseSelection(model, body)
         self._few, self._many = (visible_samples(views, body, count, model.mesh.area) for count in (_FEW, _MANY))
-        self._whole = visible_samples(views, np.ones(len(body), bool), _MANY, model.mesh.area)
+        self._whole = visible_samples(views, np.ones(len(body), bool), _MOST, model.mesh.area)
         self._scale = length_scale(model)
 
     def poses(self, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
