@@ -200,6 +200,10 @@ def test_records_go_on_where_they_were_stopped(tmp_path):
     assert ("dense 1", 1.0, 2, 4) in Records(path, header)
     with pytest.raises(ValueError, match=r"records.jsonl: .* choose another file"):
         Records(path, {"object": "bunny"})
+    path.write_text(json.dumps({"key": [1], "score": [0.5] * 100}) + "\n")
+    with pytest.raises(ValueError, match=r"its first line does not hold the settings; choose another file") as refused:
+        Records(path, {"object": "bunny"})
+    assert len(str(refused.value)) < 250  # the line itself is not repeated
     path.write_text("no records\n")
     with pytest.raises(ValueError, match=r"records.jsonl: cannot continue"):
         Records(path, header)

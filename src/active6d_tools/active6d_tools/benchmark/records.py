@@ -58,6 +58,8 @@ class Records:
         whole = text[: text.rfind("\n") + 1]
         try:
             first, *entries = [json.loads(line) for line in whole.splitlines()]
+            if first.keys() != header.keys():
+                raise ValueError("its first line does not hold the settings; choose another file")
             if first != header:
                 raise ValueError(f"its settings are {first}, the current ones {header}; choose another file")
             for entry in entries:
