@@ -42,15 +42,7 @@ def register(
                 A, g = np.zeros((6, 6)), np.zeros(6)
                 if _add_pairs(P, direction, samples, image, gate, A, g) < _FEWEST_PAIRS:
                     break
-                trace = 0.0
-                for i in range(6):
-                    trace += A[i, i]
-                    for j in range(i):
-                        A[i, j] = A[j, i]
-                # A direction that the samples leave free (the axis of a cup) must not move; damping holds it.
-                for i in range(6):
-                    A[i, i] += 1e-4 * trace / 6 + 1e-12
-                _move(P, np.linalg.solve(A, g))
+                move(P, A, g)
     return result
 
 
@@ -88,11 +80,7 @@ def _add_pairs(
             continue
         q = image.points[v, u]
         residual = (q[0] - x) * nx + (q[1] - y) * ny + (q[2] - z) * nz
-        J = (ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx, nx, ny, nz)
-        for i in range(6):
-            g[i] += J[i] * residual
-            for j in range(i, 6):
-                A[i, j] += J[i] * J[j]
+        add_equation(ax, ay, az, nx, ny, nz, residual, A, g)
         pairs += 1
     return pairs
 
@@ -116,8 +104,40 @@ def _nearest_pixel(x: float, y: float, z: float, gate: float, image: MeasuredIma
 
 
 @compiled
-def _move(P: np.ndarray, step: np.ndarray) -> None:
-    """Rotate a (4, 4) pose about its own origin by a rotation vector, at most 0.4 rad, and shift it; in place."""
+def add_equation(
+    ax: float, ay: float, az: float, nx: float, ny: float, nz: float, residual: float, A: np.ndarray, g: np.ndarray
+) -> None:
+    """Add one point-to-plane equation to the upper half of (6, 6) ``A`` and to (6,) ``g``.
+
+    Args:
+        ax, ay, az: from the pose's origin to the sample, optical frame, metres.
+        nx, ny, nz: unit normal of the sample.
+        residual: from the sample to its measured point along the normal, metres.
+        A: normal equations.
+        g: right-hand side.
+    """
+    J = (ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx, nx, ny, nz)
+    for i in range(6):
+        g[i] += J[i] * residual
+        for j in range(i, 6):
+            A[i, j] += J[i] * J[j]
+
+
+@compiled
+def move(P: np.ndarray, A: np.ndarray, g: np.ndarray) -> None:
+    """Solve (6, 6) normal equations, of which the upper half is given, and move a (4, 4) pose accordingly; in place.
+
+    It is rotated about its own origin, by at most 0.4 rad, and shifted.
+    """
+    trace = 0.0
+    for i in range(6):
+        trace += A[i, i]
+        for j in range(i):
+            A[i, j] = A[j, i]
+    # A direction that the samples leave free (the axis of a cup) must not move; damping holds it.
+    for i in range(6):
+        A[i, i] += 1e-4 * trace / 6 + 1e-12
+    step = np.linalg.solve(A, g)
     angle = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
     if angle > 1e-12:
         x, y, z = step[0] / angle, step[1] / angle, step[2] / angle

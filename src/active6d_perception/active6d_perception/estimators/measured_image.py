@@ -33,35 +33,29 @@ def measure_image(depth: np.ndarray, camera: PinholeCamera) -> MeasuredImage:
         camera: intrinsics.
     """
     reach = max(1, round(_REACH * camera.width))
-    smooth = smooth_within_surfaces(np.ascontiguousarray(depth, np.float32))
+    smooth = _smooth_within_surfaces(np.ascontiguousarray(depth, np.float32))
     intrinsics = float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)
     points = _backproject(smooth, *intrinsics)
     return MeasuredImage(points, _normals(points, reach), *intrinsics)
 
 
-@compiled
-def smooth_within_surfaces(depth: np.ndarray) -> np.ndarray:
-    """(H, W) float32 depth in metres, smoothed along rows and columns over neighbours at most 8 mm nearer or farther.
+def _smooth_within_surfaces(depth: np.ndarray) -> np.ndarray:
+    """(H, W) float32 depth in metres, smoothed along rows and columns; edges stay sharp, invalid pixels invalid."""
+    along = _smooth_rows(depth)
+    return np.ascontiguousarray(_smooth_rows(np.ascontiguousarray(along.T)).T)
 
-    Invalid pixels (NaN) stay invalid, and edges stay sharp.
-    """
+
+@compiled
+def _smooth_rows(depth: np.ndarray) -> np.ndarray:
+    """Means along rows over neighbours at most 8 mm nearer or farther; NaN stays."""
     height, width = depth.shape
-    along = np.empty_like(depth)
+    result = np.empty_like(depth)
     for v in range(height):
         for u in range(width):
             own, total, count = depth[v, u], np.float32(0), 0
             for other in range(max(0, u - _SMOOTHED), min(width, u + _SMOOTHED + 1)):
                 if abs(depth[v, other] - own) < _GATE:
                     total += depth[v, other]
-                    count += 1
-            along[v, u] = total / count if count else np.nan
-    result = np.empty_like(depth)
-    for v in range(height):
-        for u in range(width):
-            own, total, count = along[v, u], np.float32(0), 0
-            for other in range(max(0, v - _SMOOTHED), min(height, v + _SMOOTHED + 1)):
-                if abs(along[other, u] - own) < _GATE:
-                    total += along[other, u]
                     count += 1
             result[v, u] = total / count if count else np.nan
     return result

@@ -45,7 +45,7 @@ def weigh_poses(T: np.ndarray, judge: Judge, image: MeasuredImage) -> np.ndarray
         through, that something hides, that fit in depth whatever the normal, and that are not measured. Of the outline,
         the share beyond which something farther away was measured, and the share beyond which the surface continues.
     """
-    result = np.zeros((len(T), 7))
+    result = np.zeros((len(T), CONTINUED + 1))
     for k in range(len(T)):
         direction = direction_of(T[k], judge.samples.nearest)
         _weigh_surface(T[k], direction, judge, image, result[k])

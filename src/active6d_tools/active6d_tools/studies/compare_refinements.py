@@ -59,7 +59,7 @@ def main() -> None:
     for sample in track(samples):
         depth, camera = pool_depth(sample.view.depth, OUTPUT_STRIDE), output_camera(sample.view.camera)
         instances = decode(estimator.ask(sample.view), depth, camera, trained.canonical_frame, model.diameter)
-        measured = MeasuredSurface.of(sample.view, instances).of_instances()
+        measured = MeasuredSurface.of(sample.view, instances).of_instances
         true = sample.T_camera_object[sample.visible_fraction >= 0.1]
         if not len(instances) or not len(true):
             continue

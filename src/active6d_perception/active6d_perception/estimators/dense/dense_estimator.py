@@ -31,7 +31,7 @@ from active6d_perception.estimators.dense.network_input import (
     reduce_view,
     reduction,
 )
-from active6d_perception.estimators.dense.pose_search import COMPARED_POINTS, PoseSearch
+from active6d_perception.estimators.dense.pose_search import PoseSearch
 from active6d_perception.estimators.dense.trained_network import SCORE_FEATURES, TrainedNetwork, load_network
 from active6d_perception.estimators.masks import claim_pixels
 from active6d_perception.estimators.measured_image import MeasuredImage, measure_image
@@ -225,7 +225,7 @@ class DenseEstimator:
         self, T_camera_object: np.ndarray, instance: np.ndarray, certainty: np.ndarray, surface: MeasuredSurface
     ) -> tuple[Poses, np.ndarray]:
         pixels = np.bincount(surface.owner[surface.owner >= 0], minlength=instance.max(initial=0) + 1)[instance]
-        points, normals, number = surface.points_of_instances(COMPARED_POINTS)
+        points, normals, number = surface.compared_points
         of_instances = points[instance], normals[instance], number[instance]
         compared = pose_features(T_camera_object[:, None], self._judge, self._grid, surface.detail, of_instances)
         features = np.column_stack([compared[:, 0], np.log(np.maximum(pixels, 1))])

@@ -1,6 +1,7 @@
 """The surface that a view measured, and the instance that each pixel belongs to."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -8,6 +9,8 @@ from active6d_core.camera import PinholeCamera, View, backproject, normals_from_
 from active6d_perception.estimators.dense.decoding import Instances, member_table
 from active6d_perception.estimators.dense.network_input import OUTPUT_STRIDE
 from active6d_perception.estimators.measured_image import MeasuredImage, measure_image
+
+_COMPARED_POINTS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +64,18 @@ class MeasuredSurface:
             len(instances),
         )
 
+    @cached_property
     def of_instances(self) -> MeasuredImage:
         """The points of the instances, for registration; other pixels are NaN."""
         usable = (self.owner >= 0) & np.isfinite(self.normals).all(axis=-1)
         points = np.where(usable[..., None], self.points, np.float32(np.nan))
         intrinsics = self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
         return MeasuredImage(points, np.ascontiguousarray(self.normals), *map(float, intrinsics))
+
+    @cached_property
+    def compared_points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The points of each instance that its poses are compared with, see :meth:`points_of_instances`."""
+        return self.points_of_instances(_COMPARED_POINTS)
 
     def points_of_instances(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Evenly spaced points of each instance.

@@ -25,8 +25,6 @@ from active6d_perception.model.ambiguity import ambiguity_of
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.visible_samples import VisibleSamples, visible_samples
 
-#: Points of an instance that its poses are compared with.
-COMPARED_POINTS = 64
 # Orientations of the coarse search per instance. Where the whole surface shows the orientation, there are more of them.
 _SEARCHED, _SEARCHED_ALL = 6, 16
 # Candidates per instance that are registered with many samples, the best after a first registration with few.
@@ -54,7 +52,7 @@ class PoseSearch:
 
     def poses(self, instances: Instances, surface: MeasuredSurface) -> np.ndarray:
         """(n, 4, 4) ``T_camera_object`` of the instances' bodies, metres; the rotation about an axis is arbitrary."""
-        measured, points = surface.of_instances(), surface.points_of_instances(COMPARED_POINTS)
+        measured, points = surface.of_instances, surface.compared_points
         candidates = self._candidates(instances, surface, measured)
         value = self._selection.value(candidates, surface.detail, points)
         best = np.argsort(-value, axis=1, kind="stable")[:, :_KEPT]
@@ -69,9 +67,9 @@ class PoseSearch:
         Returns:
             (n, c, 4, 4) ``T_camera_object``, metres, the network's own first; and (n, c, f) their :data:`.FEATURES`.
         """
-        measured = surface.of_instances()
+        measured = surface.of_instances
         T = self._register(self._candidates(instances, surface, measured), measured, self._many, _FINE)
-        return T, self._selection.features(T, surface.detail, surface.points_of_instances(COMPARED_POINTS))
+        return T, self._selection.features(T, surface.detail, surface.compared_points)
 
     def _candidates(self, instances: Instances, surface: MeasuredSurface, measured: MeasuredImage) -> np.ndarray:
         """(n, c, 4, 4) ``T_camera_object`` after the first registration, metres, the network's own first."""
@@ -87,7 +85,7 @@ class PoseSearch:
 
     def refine(self, T_camera_object: np.ndarray, surface: MeasuredSurface) -> np.ndarray:
         """(k, 4, 4) poses that are right within millimetres, registered with all samples."""
-        return self._register(T_camera_object, surface.of_instances(), self._whole, _FINEST)
+        return self._register(T_camera_object, surface.of_instances, self._whole, _FINEST)
 
     def _register(
         self, T: np.ndarray, measured: MeasuredImage, samples: VisibleSamples, gates: tuple[float, ...]

@@ -11,7 +11,6 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.geometric.foreground import Surface, measure_surface
 from active6d_perception.estimators.geometric.multi_start import (
-    MeasuredImage,
     Starts,
     compare,
     image_of,
@@ -21,6 +20,7 @@ from active6d_perception.estimators.geometric.multi_start import (
 )
 from active6d_perception.estimators.geometric.pair_voting import PairVoting
 from active6d_perception.estimators.masks import claim_pixels
+from active6d_perception.estimators.measured_image import MeasuredImage
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.estimators.score_model import ScoreModel
 from active6d_perception.model.model_views import model_views

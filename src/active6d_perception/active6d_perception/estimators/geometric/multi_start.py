@@ -12,21 +12,10 @@ from scipy.spatial.transform import Rotation
 from active6d_core.se3 import invert
 from active6d_perception.compiled import compiled
 from active6d_perception.estimators.geometric.foreground import Surface
+from active6d_perception.estimators.image_registration import add_equation, move
+from active6d_perception.estimators.measured_image import MeasuredImage
 from active6d_perception.model.model_views import ModelViews
 from active6d_perception.model.symmetric_distance import SymmetricDistance
-
-
-class MeasuredImage(NamedTuple):
-    """A measured surface for compiled loops."""
-
-    points: np.ndarray
-    """(H, W, 3) float32 metres in the optical frame, NaN invalid"""
-    normals: np.ndarray
-    """(H, W, 3) float32 facing the camera, NaN unknown"""
-    fx: float
-    fy: float
-    cx: float
-    cy: float
 
 
 class VisibleSamples(NamedTuple):
@@ -159,15 +148,7 @@ def refine_projectively(
                 A, g = np.zeros((6, 6)), np.zeros(6)
                 if _add_pairs(P, direction, samples, image, gate, A, g) < 6:
                     break
-                trace = 0.0
-                for i in range(6):
-                    trace += A[i, i]
-                    for j in range(i):
-                        A[i, j] = A[j, i]
-                # A direction that the samples leave free (the axis of a cup) must not move; damping holds it.
-                for i in range(6):
-                    A[i, i] += 1e-4 * trace / 6 + 1e-12
-                _move(P, np.linalg.solve(A, g))
+                move(P, A, g)
     return result
 
 
@@ -207,36 +188,9 @@ def _add_pairs(
         m = image.normals[v, u]
         if not (m[0] * nx + m[1] * ny + m[2] * nz > 0.5):
             continue
-        residual = qx * nx + qy * ny + qz * nz
-        J = (ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx, nx, ny, nz)
-        for i in range(6):
-            g[i] += J[i] * residual
-            for j in range(i, 6):
-                A[i, j] += J[i] * J[j]
+        add_equation(ax, ay, az, nx, ny, nz, qx * nx + qy * ny + qz * nz, A, g)
         pairs += 1
     return pairs
-
-
-@compiled
-def _move(P: np.ndarray, step: np.ndarray) -> None:
-    """Rotate a (4, 4) pose about its own origin by a rotation vector, at most 0.4 rad, and shift it; in place."""
-    angle = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-    if angle > 1e-12:
-        x, y, z = step[0] / angle, step[1] / angle, step[2] / angle
-        angle = min(angle, 0.4)
-        s, c = np.sin(angle), np.cos(angle)
-        C = 1 - c
-        R = np.array(
-            [
-                [c + x * x * C, x * y * C - z * s, x * z * C + y * s],
-                [y * x * C + z * s, c + y * y * C, y * z * C - x * s],
-                [z * x * C - y * s, z * y * C + x * s, c + z * z * C],
-            ]
-        )
-        P[:3, :3] = R @ P[:3, :3].copy()
-    P[0, 3] += step[3]
-    P[1, 3] += step[4]
-    P[2, 3] += step[5]
 
 
 def surface_frames(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
