@@ -39,7 +39,7 @@ def surface_of(model, T_camera_object, owner=0):
     points = backproject(depth, CAMERA)
     owners = np.where(np.isfinite(depth), owner, -1)
     detail = measure_image(depth, CAMERA)
-    return MeasuredSurface(depth, points, normals_from_points(points), owners, CAMERA, detail, owner + 1)
+    return MeasuredSurface(depth, points, normals_from_points(points), owners, CAMERA, detail, max(owner, 0) + 1)
 
 
 def told(T_camera_axis):

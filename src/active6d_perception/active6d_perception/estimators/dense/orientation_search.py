@@ -110,6 +110,8 @@ class OrientationSearch:
     ) -> np.ndarray:
         """(n, k) fit in [0, 1]: mean over points of nearness to the model's surface times agreement of the normals."""
         measured, normals, number = surface.points_of_instances(points)
+        if len(number) != len(centre):  # compiled loops do not check indices
+            raise ValueError(f"the surface has {len(number)} instances, not {len(centre)}")
         from_centre = np.ascontiguousarray((measured - centre[:, None]) @ R_camera_ray, np.float32)
         normals = np.ascontiguousarray(normals @ R_camera_ray, np.float32)
         return _fit_of_points(R_ray_axis, from_centre, normals, number, self._grid)
