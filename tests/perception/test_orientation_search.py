@@ -28,7 +28,7 @@ def search(bunny):
     return OrientationSearch(bunny, canonical_frame_of(bunny))
 
 
-def surface_of(model, T_camera_object, owner=0):
+def surface_of(model, T_camera_object, owner=0, instances=1):
     """A bunny alone; ``owner`` is said to have all its pixels."""
     scene = o3d.t.geometry.RaycastingScene()
     vertices = transform_points(T_camera_object, np.asarray(model.mesh.vertices))
@@ -39,7 +39,7 @@ def surface_of(model, T_camera_object, owner=0):
     points = backproject(depth, CAMERA)
     owners = np.where(np.isfinite(depth), owner, -1)
     detail = measure_image(depth, CAMERA)
-    return MeasuredSurface(depth, points, normals_from_points(points), owners, CAMERA, detail, max(owner, 0) + 1)
+    return MeasuredSurface(depth, points, normals_from_points(points), owners, CAMERA, detail, instances)
 
 
 def told(T_camera_axis):
@@ -67,10 +67,10 @@ def test_an_orientation_near_the_truth_is_among_few(bunny, search, seed):
 
 def test_an_instance_without_measured_surface_gets_what_the_network_says(bunny, search):
     T = np.stack([make_transform(np.eye(3), np.array([x, 0.0, 0.8])) for x in (-0.1, 0.1)])
-    found = search.candidates(told(T), surface_of(bunny, T[0]), 3)
+    found = search.candidates(told(T), surface_of(bunny, T[0], instances=2), 3)
     assert found.shape == (2, 3, 4, 4)
     assert all(is_rigid(pose, 1e-5) for pose in found.reshape(-1, 4, 4))
     # Nothing else is known than the axis, which the best therefore has.
     assert found[1, 0, :3, 2] @ T[1, :3, 2] > np.cos(np.radians(15))
-    nothing = search.candidates(told(T[:0]), surface_of(bunny, T[0], owner=-1), 3)
+    nothing = search.candidates(told(T[:0]), surface_of(bunny, T[0], owner=-1, instances=0), 3)
     assert nothing.shape == (0, 3, 4, 4)
