@@ -86,7 +86,7 @@ def test_killed_estimator_comes_back_and_the_episode_ends_as_ever(graphs, tmp_pa
             "pose_estimator",
             signal.SIGSTOP,
             marks=pytest.mark.xfail(
-                reason="in about half of the runs the restarted estimator gets no view", strict=False
+                reason="in 3 of 8 runs the restarted estimator did not answer its view", strict=False
             ),
         ),
     ],
