@@ -85,6 +85,29 @@ def test_ctrl_c_at_any_time_of_the_start_is_exit_code_130(delay):
     assert "Traceback" not in process.stderr.read()
 
 
+# What a library does that catches the exception: the interpreter remembers that exec() was left by it.
+CAUGHT = """
+def run():
+    try:
+        exec("os.kill(os.getpid(), signal.SIGINT)")
+    except KeyboardInterrupt:
+        sys.exit(1)
+"""
+CLOSING = """
+def run():
+    atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))
+    sys.exit(0)
+"""
+
+
+@pytest.mark.parametrize("run", [CAUGHT, CLOSING], ids=["caught", "closing"])
+def test_ctrl_c_that_a_library_catches_or_that_comes_at_the_end_is_exit_code_130(run):
+    script = f"import atexit, os, signal, sys\nfrom active6d_tools import cli, command\n{run}"
+    script += "cli.main = run\ncommand.main()"
+    ended = subprocess.run([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True)
+    assert (ended.returncode, ended.stderr) == (130, "active6d: interrupted\n")
+
+
 def modules(process):
     """A word that says that the command's own handler is in place: it ignores neither signal by default."""
     with open(f"/proc/{process}/status") as file:

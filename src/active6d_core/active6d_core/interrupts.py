@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing import active_children, get_context
 from pathlib import Path
+from types import FrameType
 
 #: Exit code of what a Ctrl-C has ended.
 INTERRUPTED = 130
@@ -40,7 +41,7 @@ class Interrupts:
         os.set_blocking(write, False)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
         for number in _SIGNALS:
-            signal.signal(number, signal.default_int_handler)
+            signal.signal(number, self._raise)
         threading.Thread(target=self._wait, args=(read,), daemon=True).start()
 
     @contextmanager
@@ -51,6 +52,11 @@ class Interrupts:
             yield
         finally:
             self._last.remove(action)
+
+    def _raise(self, number: int, frame: FrameType | None) -> None:
+        # The thread may come too late to say so: the exception can be caught and the process at its end before.
+        self.seen.set()
+        raise KeyboardInterrupt
 
     def _wait(self, read: int) -> None:
         while not set(os.read(read, 64)) & set(_SIGNALS):

@@ -3,32 +3,47 @@
 import os
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType
+
+_WORD = b"active6d: interrupted\n"
 
 
 def main() -> None:
-    """Run the command. Ctrl-C ends it with exit code 130 at any time, while it imports as well."""
+    """Run the command. Ctrl-C ends it with exit code 130 at any time, while it imports or closes as well."""
+    _end_at_once()
+    from active6d_core.interrupts import INTERRUPTED, INTERRUPTS
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        os.write(2, b"active6d: interrupted\n")
+    code: object = INTERRUPTED
+    try:
+        from active6d_tools.cli import main as run
+
+        INTERRUPTS.watch()
+        try:
+            run()
+        finally:
+            _end_at_once()
+    except KeyboardInterrupt:
+        code = None
+    except SystemExit as end:
+        code = end.code
+        if code != INTERRUPTED and not INTERRUPTS.seen.is_set():
+            raise
+    with suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        if code != INTERRUPTED:  # nothing has said so yet
+            os.write(2, _WORD)
+    # Libraries may wait for their threads when the interpreter ends. An interpreter that saw a KeyboardInterrupt within
+    # exec() ends itself with SIGINT, even if the exception was caught.
+    os._exit(INTERRUPTED)
+
+
+def _end_at_once() -> None:
+    def end(number: int, frame: FrameType | None) -> None:
+        with suppress(OSError):
+            os.write(2, _WORD)
         os._exit(130)
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
-    from active6d_core.interrupts import INTERRUPTED, INTERRUPTS
-    from active6d_tools.cli import main as run
-
-    INTERRUPTS.watch()
-    try:
-        run()
-    except KeyboardInterrupt:
-        INTERRUPTS.seen.set()
-    except SystemExit as end:
-        if not INTERRUPTS.seen.is_set():
-            raise
-        if end.code != INTERRUPTED:
-            print("active6d: interrupted", file=sys.stderr)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    if INTERRUPTS.seen.is_set():
-        os._exit(INTERRUPTED)  # libraries may wait for their threads when the interpreter ends
+        signal.signal(number, end)
