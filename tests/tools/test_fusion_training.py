@@ -11,21 +11,28 @@ from active6d_perception.scene.belief_weights import BeliefWeights
 from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_tools import fusion_training
-from active6d_tools.fusion_training import count_scenes, describe_scene, draw_views, fit_fusion, label_scene
+from active6d_tools.fusion_training import count_scenes, describe_scene, fit_fusion, label_scene
+from active6d_tools.processed_scene import ViewPool
 
 SPHERE = ViewSphere()
 
 
-def test_views_of_a_ring_are_spread_and_others_are_drawn():
+def test_pool_has_a_ring_and_draws_only_its_views():
+    pool = ViewPool(SPHERE, 30, np.random.default_rng(0))
+    assert len(set(pool.views)) == 30
+    assert set(pool.ring) <= set(pool.views)
     rng = np.random.default_rng(0)
-    ring = SPHERE.positions[draw_views(SPHERE, 5, ring=True, rng=rng)]
+    ring = SPHERE.positions[pool.draw(5, ring=True, rng=rng)]
     angles = SPHERE.angles(ring)
     np.testing.assert_allclose(np.degrees(angles[:, 1]), 45, atol=1e-6)
     apart = np.diff(np.sort(angles[:, 0] % (2 * np.pi)))
     assert np.degrees(apart).min() > 50
-    drawn = draw_views(SPHERE, 20, ring=False, rng=rng)
+    drawn = pool.draw(20, ring=False, rng=rng)
     assert len(set(drawn)) == 20
-    assert drawn != draw_views(SPHERE, 20, ring=False, rng=rng)
+    assert set(drawn) <= set(pool.views)
+    assert drawn != pool.draw(20, ring=False, rng=rng)
+    with pytest.raises(ValueError, match="at least the 6 views"):
+        ViewPool(SPHERE, 5, rng)
 
 
 def test_scenes_are_those_of_the_splits():

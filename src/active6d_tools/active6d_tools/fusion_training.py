@@ -9,27 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from active6d_core.camera import View
-from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import DETECTION_FRACTION, e_add
-from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
-from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimators.registry import create_estimator
 from active6d_perception.scene.belief_training import LabelledPlaces, fit_belief, fit_probability, label_places
 from active6d_perception.scene.belief_weights import BeliefWeights
 from active6d_perception.scene.joint_fusion import JointFusion
-from active6d_perception.scene.verification import Verifier
-from active6d_sim.rendering.random_sensor import sensor_of
-from active6d_sim.rendering.simulator import NANOSECONDS, Simulator
-from active6d_sim.scenes.scene_store import SPLITS, find_scene, scene_path
+from active6d_sim.scenes.scene_store import SPLITS, scene_path
+from active6d_tools.processed_scene import ProcessedScene, ProcessedView, add_view
 
 #: Scenes to fit the belief to, and scenes to fit the probability to, which are others: a belief is too sure of the
 #: scenes that it was fitted to.
 BELIEF_SPLIT, PROBABILITY_SPLITS = "train", ("val", "wild_val")
 # Views per episode, in turn.
 _VIEWS = (6, 2, 6, 3, 6, 1, 6, 10, 6, 4, 6, 20)
-_RING = np.radians(45.0)
 
 
 def fit_fusion(
@@ -124,30 +116,13 @@ def describe_scene(name: str, *, weights: BeliefWeights, episodes: int, estimato
 
 def _episodes(
     name: str, weights: BeliefWeights, episodes: int, estimator: str, seed: int
-) -> Iterator[tuple[JointFusion, View, np.ndarray]]:
+) -> Iterator[tuple[JointFusion, ProcessedView, np.ndarray]]:
     """Fusion after each episode's views, its last view, and the true poses."""
-    model, sphere = load_object(name.split("/")[0]), ViewSphere()
-    scene = find_scene(model.name, name, 0)
-    simulator = Simulator(scene, noise=sensor_of(AUTOMATIC, model, scene), seed=seed)
-    find, verifier = create_estimator(estimator, model), Verifier(model)
-    seen: dict[int, tuple[View, Hypotheses, np.ndarray]] = {}
-    rng = np.random.default_rng([seed, scene.seed])
+    processed = ProcessedScene(name, estimator, seed=seed)
+    fusion, rng = JointFusion(processed.model, weights=weights), np.random.default_rng([seed, int(name.split("/")[-1])])
     for episode in range(episodes):
-        fusion = JointFusion(model, weights=weights)
-        for index in draw_views(sphere, _VIEWS[episode % len(_VIEWS)], ring=episode % 4 == 0, rng=rng):
-            if index not in seen:
-                view = simulator.capture(sphere.pose(sphere.positions[index]), (index + 1) * NANOSECONDS)
-                hypotheses = find.estimate(view)
-                seen[index] = view, hypotheses, verifier.score(view.depth, view.camera, hypotheses)
-            view, hypotheses, verification = seen[index]
-            fusion.add_view(view.stamp, view.T_world_camera, hypotheses, verification, view.depth, view.camera)
-        yield fusion, view, scene.T_world_object
-
-
-def draw_views(sphere: ViewSphere, count: int, *, ring: bool, rng: np.random.Generator) -> list[int]:
-    """Draw different views of the grid: at random, or on a ring at 45 degrees as far apart as possible."""
-    if not ring:
-        return rng.choice(len(sphere), count, replace=False).tolist()
-    start = rng.uniform(0, 2 * np.pi)
-    azimuths = start + np.arange(count) * 2 * np.pi / count
-    return list(dict.fromkeys(int(sphere.nearest(sphere.position(azimuth, _RING))) for azimuth in azimuths))
+        fusion.reset()
+        for index in processed.pool.draw(_VIEWS[episode % len(_VIEWS)], ring=episode % 4 == 0, rng=rng):
+            view = processed.view(index)
+            add_view(fusion, view)
+        yield fusion, view, processed.scene.T_world_object

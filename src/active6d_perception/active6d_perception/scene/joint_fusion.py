@@ -58,11 +58,19 @@ class _SeenView:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Part of the surface: its name, rotations (r, 4, 4) to try, and points (p, 3) in the object frame, metres."""
+    """Part of the surface to compare.
+
+    Attributes:
+        name: of the part.
+        rotations: (r, 4, 4) to try.
+        points: (p, 3) of the part, object frame, metres; compared with solids.
+        samples: of the part; compared with depth images.
+    """
 
     name: str
     rotations: np.ndarray
     points: np.ndarray
+    samples: VisibleSamples
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +143,17 @@ class JointFusion:
             False if the view had been added before, and nothing has changed.
         """
         measured = measure_view(depth, camera, T_world_camera, hypotheses, self.ambiguity)
+        return self.add_measured(stamp, T_world_camera, hypotheses, verification, measured)
+
+    def add_measured(
+        self,
+        stamp: int,
+        T_world_camera: np.ndarray,
+        hypotheses: Hypotheses,
+        verification: np.ndarray,
+        measured: MeasuredView,
+    ) -> bool:
+        """:meth:`add_view` for a view that has been reduced by :func:`.measure_view`."""
         if not self._known.add_view(stamp, T_world_camera, hypotheses, verification):
             return False
         self._views[stamp] = _SeenView(measured, Memo())
@@ -142,22 +161,24 @@ class JointFusion:
 
     def evidence(self) -> SceneEvidence:
         """What all views say of every candidate that its body does not rule out."""
-        ambiguity, whole = self.ambiguity, _Part("body", np.eye(4)[None], self.ambiguity.body_points)
+        ambiguity, same = self.ambiguity, np.eye(4)[None]
+        whole = _Part("body", same, ambiguity.body_points, ambiguity.body_samples)
+        twins = _Part("twin", same, ambiguity.body_points, ambiguity.twin_samples)
         candidates = self._candidates(self._order())
         heads = _rounded(candidates.take(candidates.heads()))
         bodies = BodyEvidence(
             candidates,
-            self._count(candidates, "body")[:, 0],
-            self._count(candidates, "twin")[:, 0],
+            self._count(candidates, whole)[:, 0],
+            self._count(candidates, twins)[:, 0],
             self._in_container(candidates, whole)[:, 0],
             self._among_neighbours(candidates, heads, whole)[:, 0],
         )
         bodies = bodies.take(self._possible(bodies))
         candidates = bodies.candidates
-        telling = _Part("telling", ambiguity.rotations, ambiguity.telling_points)
+        telling = _Part("telling", ambiguity.rotations, ambiguity.telling_points, ambiguity.telling_samples)
         evidence = SceneEvidence(
             bodies,
-            self._count(candidates, "telling"),
+            self._count(candidates, telling),
             self._in_container(candidates, telling),
             self._among_neighbours(candidates, heads, telling),
             ambiguity.diameter,
@@ -192,22 +213,22 @@ class JointFusion:
             replace(found, T_world_object=self._bodies.refine(found.T_world_object, views)), ambiguity
         )
 
-    def _count(self, candidates: BodyCandidates, part: str) -> np.ndarray:
-        """(K, r or 1, CASES) counts over all views, of the samples that the ambiguity has of a part."""
+    def _count(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:
+        """(K, r, CASES) counts of a part over all views."""
         ambiguity = self.ambiguity
         rounded, keys = _rounded(candidates)
-        samples: VisibleSamples = getattr(ambiguity, f"{part}_samples")
-        rotations = ambiguity.rotations if part == "telling" else np.eye(4)[None]
-        total = np.zeros((len(keys), len(rotations), CASES), np.int64)
-        if not samples.number.any():
+        total = np.zeros((len(keys), len(part.rotations), CASES), np.int64)
+        if not part.samples.number.any():
             return total
         for view in self._views.values():
 
             def compute(missing: np.ndarray, view: _SeenView = view) -> np.ndarray:
                 place = _OWN * ambiguity.diameter
-                return count_cases(rounded[missing], rotations, ambiguity.middle, place, samples, view.measured)
+                return count_cases(
+                    rounded[missing], part.rotations, ambiguity.middle, place, part.samples, view.measured
+                )
 
-            total += view.memo.rows([(part, key) for key in keys], compute)
+            total += view.memo.rows([(part.name, key) for key in keys], compute)
         return total
 
     def _in_container(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:

@@ -16,6 +16,7 @@ from active6d_tools.cli import (
     bank,
     benchmark,
     benchmark_estimator,
+    benchmark_fusion,
     doctor,
     episode,
     estimate,
@@ -131,6 +132,7 @@ app.add_typer(bags.app, name="bag")
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
 benchmark.app.command(cls=PartsCommand)(benchmark_estimator.estimator)
+benchmark.app.command(cls=PartsCommand)(benchmark_fusion.fusion)
 benchmark.app.command(cls=PartsCommand)(benchmark.pipeline)
 app.add_typer(benchmark.app, name="benchmark")
 train_estimator.app.command()(train_fusion.fusion)
