@@ -116,6 +116,20 @@ def test_budgets_end_it(policy):
     assert decide(make_state(metres=1e-3), policy)[1] == "no reachable view is left"
 
 
+def test_seconds_are_counted_by_stamps_and_limit_the_way_at_the_pace_so_far(policy):
+    state = make_state(seconds=10.0, steps=9)
+    assert decide(state, policy)[1] == ""  # how fast the camera is shows with the first move
+    state.add_view(1 + 4 * 10**9, SPHERE.positions[5])
+    assert state.elapsed == pytest.approx(4.0)
+    decision, reason = decide(state, policy)
+    assert reason == ""
+    # Four seconds for this arc, so the six left are enough for one and a half of it.
+    arc = SPHERE.arc(SPHERE.positions[0], SPHERE.positions[5])
+    assert SPHERE.arc(SPHERE.positions[decision.view], SPHERE.positions[5]) <= 1.5 * arc + 1e-9
+    state.add_view(1 + 10 * 10**9, SPHERE.positions[decision.view])
+    assert decide(state, policy) == (None, "budget of 10 s spent")
+
+
 class BesideTheGrid:
     """Always asks for the same place, which is no view of the grid."""
 

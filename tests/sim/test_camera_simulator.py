@@ -27,6 +27,7 @@ from active6d_sim.nodes.camera_simulator import CameraSimulatorNode
 from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.sensor_registry import list_sensors, register_sensor
 from active6d_sim.rendering.simulator import Simulator
+from active6d_sim.robot.arm import CameraArm, hand_eye_error
 
 SECOND = 1_000_000_000
 TOPICS = {
@@ -144,6 +145,38 @@ def test_exact_goals_are_reached_exactly(watched):
     watched.wait(2)
     same_pose(watched.poses()[1], goal)
     assert watched.stamps()[1] == SECOND + SECOND // 10  # faster than the least time between two views
+
+
+def test_an_arm_refuses_what_it_cannot_reach_and_takes_its_time(watched, mugs):
+    watched.start(carrier="arm", hand_eye_mm=20.0, hand_eye_degrees=0.0, noise_scale=0.0)
+    watched.goal(SPHERE.pose(SPHERE.positions[5]), stamp=SECOND)
+    watched.graph.spin_until(lambda: watched.answers)
+    assert watched.statuses()[0].state == GoalState.REFUSED
+    assert watched.statuses()[0].reason == "the arm cannot take the view goal: out of reach"
+    watched.goal(SPHERE.pose(SPHERE.positions[48]), stamp=SECOND)
+    watched.wait(2)
+    told = watched.poses()[1]
+    np.testing.assert_allclose(told, SPHERE.pose(SPHERE.positions[48]), atol=1e-3)
+    arm = CameraArm(mugs)
+    arm.place(SPHERE.pose(SPHERE.positions[45]))
+    seconds = arm.plan(SPHERE.pose(SPHERE.positions[48])).seconds
+    assert watched.stamps()[1] - SECOND == pytest.approx(seconds * SECOND, abs=2)
+    # What it sees is seen from 20 mm beside where it says that it is.
+    camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
+    depth = image_to_depth(watched.boxes["camera/depth/image_raw"][1])
+    exact = Simulator(mugs, camera, ActiveStereo().scaled(0.0))
+    true = exact.capture(told @ hand_eye_error(20.0, 0.0, 0), watched.stamps()[1]).depth
+    np.testing.assert_array_equal(depth, true)
+    assert not np.array_equal(depth, exact.capture(told, watched.stamps()[1]).depth, equal_nan=True)
+
+
+def test_an_arm_that_cannot_take_the_start_view_says_so(graph):
+    node = CameraSimulatorNode(
+        context=graph.context, overrides={"scene": "mug/test/0", "carrier": "arm", "start_view": 5, "autostart": False}
+    )
+    with pytest.raises(ValueError, match="out of reach"):
+        node.setup()
+    node.destroy_node()
 
 
 def test_staying_is_a_new_view_with_new_noise(watched):

@@ -60,7 +60,7 @@ def test_objects_rest(scene):
     client = connect()
     client.setGravity(0, 0, -9.81)
     client.setPhysicsEngineParameter(fixedTimeStep=1 / 240, numSolverIterations=50)
-    heap._add_bin(client, scene.bin)
+    heap.add_bin(client, scene.bin)
     shape = client.createCollisionShape(client.GEOM_MESH, fileName=str(heap.collision_file(model)))
     bodies = []
     for T in scene.T_world_all:

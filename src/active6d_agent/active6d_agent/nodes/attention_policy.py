@@ -53,6 +53,7 @@ class AttentionPolicyNode(GraphNode):
         self.declare("policy_parameters", "{}", "parameters of the policy, a YAML mapping")
         self.declare("steps", 5, "budget of moves T; T moves give T + 1 views", minimum=0, maximum=10_000)
         self.declare("metres", 0.0, "travel budget along the hemisphere in metres, 0: no limit", minimum=0.0)
+        self.declare("seconds", 0.0, "time from the first view in which moves may begin, 0: no limit", minimum=0.0)
         self.declare("seed", 0, "seed of the policy's random generator", minimum=0)
         self.declare(
             "goal_timeout",
@@ -74,7 +75,8 @@ class AttentionPolicyNode(GraphNode):
     def setup(self) -> None:
         """Load the object and the policy."""
         timeout = self.value("goal_timeout")
-        self._budget = Limits(*self._read_views(), self.value("steps"), self.value("metres"), timeout)
+        budget = {name: self.value(name) for name in ("steps", "metres", "seconds")}
+        self._budget = Limits(*self._read_views(), **budget, goal_timeout=timeout)
         name, policy = self.value("object"), self.value("policy")
         model = load_object(name)
         self.policy_name = choose_policy(name) if policy == AUTOMATIC else policy
@@ -235,11 +237,13 @@ class AttentionPolicyNode(GraphNode):
             "seed": str(self.value("seed")),
             "moves": str(moves),
             "metres": f"{travelled:.6f}",
+            "seconds": f"{episode.elapsed:.3f}",
         }
         if self._episode_id:
             values["episode"] = self._episode_id
         self._publish(self.end, EpisodeEnd(stamp, self.world_frame, reason, values).to_message())
-        self.get_logger().info(f"episode ended after {moves} moves and {travelled:.2f} m: {reason}")
+        spent = f"{moves} moves, {travelled:.2f} m and {episode.elapsed:.1f} s"
+        self.get_logger().info(f"episode ended after {spent}: {reason}")
 
     def _publish(self, publisher: Any, message: Any) -> None:
         publisher.publish(message)

@@ -21,6 +21,7 @@ class Limits:
         allowed: (M,) bool, views of the grid that the camera can reach.
         steps: budget of moves T.
         metres: travel budget along the hemisphere in metres, 0 for none.
+        seconds: budget of time from the first view on, 0 for none.
         goal_timeout: seconds that the camera has to reach a goal, 0 for no limit.
     """
 
@@ -28,6 +29,7 @@ class Limits:
     allowed: np.ndarray
     steps: int
     metres: float = 0.0
+    seconds: float = 0.0
     goal_timeout: float = 0.0
 
 
@@ -68,6 +70,12 @@ class EpisodeState:
         return self._limits.sphere.path_length(self.positions)
 
     @property
+    def elapsed(self) -> float:
+        """Seconds from the first view to the last, by their stamps."""
+        stamps = list(self._positions)
+        return (stamps[-1] - stamps[0]) * 1e-9
+
+    @property
     def waiting(self) -> bool:
         """Whether the camera has still to reach a goal."""
         return self._goal is not None
@@ -94,10 +102,11 @@ class EpisodeState:
         if self._missed_in_a_row >= MOST_MISSED:
             missed = f"the last {MOST_MISSED} goals within {limits.goal_timeout:g} s each"
             return None, f"the camera reached none of {missed}; check that it is running"
-        metres_left = limits.metres - self.travelled if limits.metres > 0 else np.inf
+        if 0 < limits.seconds <= self.elapsed:
+            return None, f"budget of {limits.seconds:g} s spent"
         allowed, steps_left = limits.allowed & ~self._struck, limits.steps - self.moves
         observation = Observation(
-            objects, self.positions, limits.sphere, allowed, steps_left, metres_left, unexplained=unexplained
+            objects, self.positions, limits.sphere, allowed, steps_left, self._metres_left(), unexplained=unexplained
         )
         decision = self._avoid_struck(observation, policy.decide(observation))
         if decision.stop:
@@ -106,6 +115,15 @@ class EpisodeState:
             return decision, f"no reachable view is left{self._describe_struck()}"
         self._goal, self._waited = decision.position, 0.0
         return decision, ""
+
+    def _metres_left(self) -> float:
+        """Arc left in metres: of the travel budget, and of what the seconds left allow at the pace so far."""
+        limits, left = self._limits, np.inf
+        if limits.metres > 0:
+            left = limits.metres - self.travelled
+        if limits.seconds > 0 and self.travelled > 0:
+            left = min(left, (limits.seconds - self.elapsed) * self.travelled / self.elapsed)
+        return left
 
     def refused(self, reason: str) -> bool:
         """The camera refuses the goal. True if another one must be chosen; false if it has reached this one before."""

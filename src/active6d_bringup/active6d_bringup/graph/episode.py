@@ -38,7 +38,14 @@ from active6d_core.ros.conversions import (
     poses_from_array,
     stamp_to_ns,
 )
-from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, check_episode, episode_info
+from active6d_core.ros.episode_messages import (
+    EpisodeEnd,
+    EpisodeStart,
+    GoalState,
+    GoalStatus,
+    check_episode,
+    episode_info,
+)
 from active6d_core.ros.node import qos_of
 from active6d_core.view_sphere import ViewSphere
 
@@ -61,8 +68,10 @@ class EpisodeSettings:
         policy: name of the policy.
         steps: budget of moves T.
         metres: budget of metres along the hemisphere, None without one.
+        seconds: budget of seconds of motion, None without one.
         estimator: name of the estimator, None for the params file's.
         sensor: name of the simulated camera's sensor model; auto for the default one, or a random one in a wild scene.
+        carrier: what carries the simulated camera: ``flying`` for nothing, or ``arm`` for a simulated arm.
         bag: folder to create for the recording, None for no recording.
         processes: every node in a process of its own.
         params_file: ROS parameters; None takes those of this package.
@@ -78,8 +87,10 @@ class EpisodeSettings:
     policy: str = "auto"
     steps: int = 5
     metres: float | None = None
+    seconds: float | None = None
     estimator: str | None = None
     sensor: str = "auto"
+    carrier: str = "flying"
     bag: Path | None = None
     processes: bool = False
     params_file: Path | None = None
@@ -128,6 +139,7 @@ class EpisodeResult:
         reason: why the policy stopped.
         distance: metres of arc that the camera travelled.
         seconds: of wall-clock time from the first view to the end.
+        refused: why the camera refused goals, in order.
         events: what happened to the nodes, such as a restart.
     """
 
@@ -138,7 +150,13 @@ class EpisodeResult:
     reason: str
     distance: float
     seconds: float
+    refused: list[str]
     events: list[str]
+
+    @property
+    def motion_seconds(self) -> float:
+        """From the first view to the last by their stamps: the time of a simulated camera's motions."""
+        return (self.steps[-1].stamp - self.steps[0].stamp) * 1e-9
 
     @property
     def objects(self) -> SceneObjects:
@@ -191,6 +209,8 @@ def describe(settings: EpisodeSettings) -> GraphDescription:
         camera["scene"] = settings.scene
     if settings.sensor != "auto":
         camera["sensor"] = settings.sensor
+    if settings.carrier != "flying":
+        camera["carrier"] = settings.carrier
     policy: dict[str, Any] = {
         "object": settings.object,
         "seed": settings.seed,
@@ -199,6 +219,8 @@ def describe(settings: EpisodeSettings) -> GraphDescription:
     }
     if settings.metres is not None:
         policy["metres"] = float(settings.metres)
+    if settings.seconds is not None:
+        policy["seconds"] = float(settings.seconds)
     estimator = {"object": settings.object}
     if settings.estimator is not None:
         estimator["estimator"] = settings.estimator
@@ -307,12 +329,14 @@ class EpisodeMonitor(Node):
         self._ground_truth: np.ndarray | None = None
         self._starts: list[EpisodeStart] = []
         self._ends: list[EpisodeEnd] = []
+        self._refused: list[str] = []
         self._reason = ""
         self._began = self._ended = 0.0
         self._listen(topics.CAMERA_POSE, self._on_pose)
         self._listen(topics.HYPOTHESES, self._on_hypotheses)
         self._listen(topics.OBJECTS, self._on_objects)
         self._listen(topics.VIEW_GOAL, self._on_goal)
+        self._listen(topics.GOAL_STATUS, self._on_goal_status)
         self._listen(topics.GROUND_TRUTH, self._on_ground_truth)
         self._listen(topics.EPISODE_START, self._on_start)
         self._listen(topics.EPISODE_END, self._on_end)
@@ -346,6 +370,7 @@ class EpisodeMonitor(Node):
             reason=self._reason,
             distance=steps[-1].distance,
             seconds=self._ended - self._began,
+            refused=self._refused,
             events=events,
         )
 
@@ -397,6 +422,11 @@ class EpisodeMonitor(Node):
 
     def _on_goal(self, message: PoseStamped) -> None:
         self._goals[stamp_to_ns(message.header.stamp)] = pose_stamped_to_transform(message, message.header.frame_id)
+
+    def _on_goal_status(self, message: DiagnosticArray) -> None:
+        status = GoalStatus.from_message(message)
+        if status.state is GoalState.REFUSED:
+            self._refused.append(status.reason)
 
     def _on_ground_truth(self, message: PoseArray) -> None:
         self._ground_truth = poses_from_array(message, message.header.frame_id)

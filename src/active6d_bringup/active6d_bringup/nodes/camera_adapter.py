@@ -30,7 +30,6 @@ from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.runner import run_node
 from active6d_core.ros.transform_input import TransformInput
-from active6d_core.se3 import transform_from_quaternion
 
 _NOT_SET = [0.0] * 7
 _PENDING = 16
@@ -102,9 +101,9 @@ class CameraAdapterNode(GraphNode):
         name, rectified = self.value("color_topic"), self.value("rectified")
         is_rectified = "rect" in name.rsplit("/", 2)[-1] if rectified == "auto" else rectified == "yes"
         self._maker = ViewMaker(self.value("depth_scale"), is_rectified)
-        self._T_pose_camera = self._read_pose("hand_eye")
+        self._T_pose_camera = self.rigid_transform("hand_eye")
         extrinsics = self.value("depth_to_color")
-        self._T_color_depth = None if extrinsics == _NOT_SET else self._read_pose("depth_to_color")
+        self._T_color_depth = None if extrinsics == _NOT_SET else self.rigid_transform("depth_to_color")
         self._asks_extrinsics = bool(self.value("depth_info_topic")) and self._T_color_depth is None
         if self._transforms is None and (not self.value("pose_topic") or self._asks_extrinsics):
             self._transforms = TransformInput(self)
@@ -118,12 +117,6 @@ class CameraAdapterNode(GraphNode):
         self._infos: dict[str, Any] = {}
         self._goal_stamp: int | None = None
         self._begins, self._last_stamp, self._requests, self._unmatched, self._color_frame = True, -1, 0, 0, ""
-
-    def _read_pose(self, name: str) -> np.ndarray:
-        numbers = np.array(self.value(name), float)
-        if numbers.shape != (7,) or abs(np.linalg.norm(numbers[3:]) - 1.0) > 1e-3:
-            raise ValueError(f"{self.get_name()}: parameter '{name}' must be x y z and a unit quaternion qx qy qz qw")
-        return transform_from_quaternion(numbers[3:], numbers[:3])
 
     def awaited(self) -> Awaited:
         """The stream while a view is due, else the next goal."""

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.context import Context
 from rclpy.exceptions import (
@@ -15,6 +16,7 @@ from rclpy.exceptions import (
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 
+from active6d_core.se3 import transform_from_quaternion
 from active6d_core.structured_text import parse_yaml
 
 _LARGEST_INTEGER = 2**63 - 1
@@ -130,6 +132,17 @@ class ParameterNode(LifecycleNode):
         """The value of a declared parameter; arrays are lists."""
         value = self.get_parameter(name).value
         return value.tolist() if hasattr(value, "tolist") else value
+
+    def rigid_transform(self, name: str) -> np.ndarray:
+        """(4, 4) transform of a parameter that holds x y z in metres and the quaternion qx qy qz qw.
+
+        Raises:
+            ValueError: it holds something else; the message names the parameter.
+        """
+        numbers = np.array(self.value(name), float)
+        if numbers.shape != (7,) or not abs(np.linalg.norm(numbers[3:]) - 1.0) <= 1e-3:
+            raise ValueError(f"{self.get_name()}: parameter '{name}' must be x y z and a unit quaternion qx qy qz qw")
+        return transform_from_quaternion(numbers[3:], numbers[:3])
 
     def mapping(self, name: str) -> dict[str, Any]:
         """The value of a text parameter that holds a YAML mapping.

@@ -1,5 +1,6 @@
 """Node ``camera_simulator``: an RGB-D camera above a simulated pile of objects."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,12 @@ from active6d_core.camera import PinholeCamera, View
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
 from active6d_core.ros.runner import run_node
+from active6d_core.se3 import quaternion_from_transform
 from active6d_sim.nodes.moving_camera import MovingCameraNode
 from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.sensor_registry import list_sensors
-from active6d_sim.rendering.simulator import Simulator, admit_goal
+from active6d_sim.rendering.simulator import GoalError, Simulator, admit_goal
+from active6d_sim.robot.arm import CARRIERS, ArmSettings, CameraArm, Motion, hand_eye_error
 from active6d_sim.scenes.scene_store import SPLITS, find_scene
 
 
@@ -29,12 +32,31 @@ class CameraSimulatorNode(MovingCameraNode):
         self.declare("width", 640, "image width in pixels", minimum=16, maximum=4096)
         self.declare("height", 480, "image height in pixels", minimum=16, maximum=4096)
         self.declare("field_of_view", 60.0, "horizontal field of view in degrees", minimum=5.0, maximum=150.0)
+        self._declare_arm()
         self.create_service(Trigger, "~/next_scene", self._on_next_scene)
+
+    def _declare_arm(self) -> None:
+        usual = ArmSettings()
+        base = [*usual.T_world_base[:3, 3].tolist(), *quaternion_from_transform(usual.T_world_base).tolist()]
+        self.declare(
+            "carrier", CARRIERS[0], "what carries the camera: flying for nothing, or a simulated arm", choices=CARRIERS
+        )
+        self.declare("arm_base", base, "x y z qx qy qz qw of the arm's base in the world, metres")
+        self.declare("arm_speed", usual.speed, "fraction of the arm's largest joint speeds", minimum=0.01, maximum=1.0)
+        self.declare("hand_eye_mm", 1.0, "error of the arm's hand-eye calibration in millimetres", minimum=0.0)
+        self.declare("hand_eye_degrees", 0.2, "error of the arm's hand-eye calibration in degrees", minimum=0.0)
 
     def setup(self) -> None:
         """Simulate or load the scene."""
         super().setup()
         self.check_start_view(len(self.sphere))
+        self._T_calibrated_true = np.eye(4)
+        self._arm: CameraArm | None = None
+        self._motion: Motion | None = None
+        if self.value("carrier") == "arm":
+            self._T_calibrated_true = hand_eye_error(
+                self.value("hand_eye_mm"), self.value("hand_eye_degrees"), self.seed
+            )
         self._camera = PinholeCamera.from_field_of_view(
             self.value("width"), self.value("height"), self.value("field_of_view")
         )
@@ -44,6 +66,10 @@ class CameraSimulatorNode(MovingCameraNode):
         scene = find_scene(self.object_name, scene_name, seed)
         sensor = sensor_of(self.value("sensor"), load_object(self.object_name), scene)
         self._simulator = Simulator(scene, self._camera, sensor.scaled(self.value("noise_scale")), self.seed)
+        if self.value("carrier") == "arm":
+            self._arm = CameraArm(scene, ArmSettings(self.rigid_transform("arm_base"), speed=self.value("arm_speed")))
+            if self.value("start_view") >= 0:
+                self._arm.place(self._grid_pose(self.value("start_view")))
 
     @property
     def scene_name(self) -> str:
@@ -51,11 +77,20 @@ class CameraSimulatorNode(MovingCameraNode):
         return self._simulator.scene.name
 
     def draw_start(self) -> int:
-        """Any view of the grid."""
-        return int(np.random.default_rng([self.seed, self._simulator.scene.seed]).integers(len(self.sphere)))
+        """Any view of the grid; with an arm, any that it reaches."""
+        rng = np.random.default_rng([self.seed, self._simulator.scene.seed])
+        if self._arm is None:
+            return int(rng.integers(len(self.sphere)))
+        for view in rng.permutation(len(self.sphere)):
+            if self._arm.reaches(self._grid_pose(view)):
+                return int(view)
+        raise GoalError("the arm reaches no view of the grid; check arm_base and radius")
 
     def start_pose(self, view: int) -> np.ndarray:
         """At the grid's view, facing the bin's centre."""
+        return self._grid_pose(view) if self._arm is None else self._arm.place(self._grid_pose(view))
+
+    def _grid_pose(self, view: int) -> np.ndarray:
         return self.sphere.pose(self.sphere.positions[view])
 
     def truth(self, view: int) -> np.ndarray:
@@ -64,11 +99,23 @@ class CameraSimulatorNode(MovingCameraNode):
 
     def destination(self, T_world_goal: np.ndarray) -> np.ndarray:
         """The goal, or the grid's view nearest to it."""
-        return admit_goal(T_world_goal, self.sphere, snap=self.value("snap_to_grid"), tolerance=self.tolerance)
+        admitted = admit_goal(T_world_goal, self.sphere, snap=self.value("snap_to_grid"), tolerance=self.tolerance)
+        if self._arm is None:
+            return admitted
+        self._motion = self._arm.plan(admitted)
+        return self._motion.T_world_camera
+
+    def travel(self, T_world_camera: np.ndarray) -> float:
+        """A camera without an arm moves along the hemisphere."""
+        if self._arm is None or self._motion is None:
+            return super().travel(T_world_camera)
+        self._arm.follow(self._motion)
+        return self._motion.seconds
 
     def capture(self, T_world_camera: np.ndarray, stamp: int) -> View:
-        """What the sensor sees from there."""
-        return self._simulator.capture(T_world_camera, stamp)
+        """What the sensor sees from there; with an arm, from beside it by the error of the calibration."""
+        view = self._simulator.capture(T_world_camera @ self._T_calibrated_true, stamp)
+        return replace(view, T_world_camera=T_world_camera)
 
     def _on_next_scene(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """A new episode in the next stored scene of the split, or in a pile simulated by the next seed."""

@@ -98,6 +98,11 @@ class MovingCameraNode(GraphNode):
             MessageError: there is none, now.
         """
 
+    def travel(self, T_world_camera: np.ndarray) -> float:
+        """Go to what :meth:`destination` gave last; the seconds of simulated time that this takes."""
+        arc = self.sphere.arc(self._T_world_camera[:3, 3], T_world_camera[:3, 3])
+        return float(arc) / self._speed
+
     # Views
 
     def setup(self) -> None:
@@ -121,7 +126,7 @@ class MovingCameraNode(GraphNode):
         start = self.value("start_view")
         if start < 0:
             start = self.draw_start()
-        stamp = arrival(self._stamp, 0.0, self._speed) if self._stamp else NANOSECONDS
+        stamp = arrival(self._stamp, 0.0) if self._stamp else NANOSECONDS
         self._photograph(self.start_pose(start), stamp, start)
 
     def _photograph(self, T_world_camera: np.ndarray, stamp: int, start: int | None = None) -> None:
@@ -154,8 +159,7 @@ class MovingCameraNode(GraphNode):
         try:
             T_world_camera = self._admit(message)
             self._answer(stamp, GoalState.ACCEPTED)
-            arc = self.sphere.arc(self._T_world_camera[:3, 3], T_world_camera[:3, 3])
-            self._photograph(T_world_camera, arrival(self._stamp, float(arc), self._speed))
+            self._photograph(T_world_camera, arrival(self._stamp, self.travel(T_world_camera)))
         except MessageError as error:
             self._answer(stamp, GoalState.REFUSED, str(error))
             raise

@@ -108,7 +108,7 @@ def settle(
             contactERP=0.1,
             deterministicOverlappingPairs=1,
         )
-        table = _add_bin(client, bin)
+        table = add_bin(client, bin)
         shape = client.createCollisionShape(pybullet.GEOM_MESH, fileName=str(collision_file(model)))
         falling = [(shape, model.diameter)] * count + [_hull(client, mesh) for mesh in others]
         order = [int(i) for i in rng.permutation(len(falling))] if others else list(range(count))
@@ -189,7 +189,7 @@ def _remove_fallen(client: BulletClient, bodies: list[int], table: int) -> list[
     return kept
 
 
-def _add_bin(client: BulletClient, bin: Bin) -> int:
+def add_bin(client: BulletClient, bin: Bin) -> int:
     """Add the bin and its table; returns the table's body."""
     outer = np.array([bin.inner_width, bin.inner_depth]) / 2 + bin.wall_thickness
     _add_box(client, (0, 0, -bin.wall_thickness / 2), (*outer, bin.wall_thickness / 2))

@@ -73,6 +73,6 @@ def admit_goal(T_world_goal: np.ndarray, sphere: ViewSphere, *, snap: bool, tole
     return sphere.pose(sphere.positions[sphere.nearest(position)]) if snap else np.array(T_world_goal, float)
 
 
-def arrival(stamp: int, arc: float, speed: float) -> int:
-    """Stamp (ns) of the view after a move of ``arc`` metres at ``speed`` metres a second, at least 0.1 s later."""
-    return stamp + max(round(arc / speed * NANOSECONDS), NANOSECONDS // 10)
+def arrival(stamp: int, seconds: float) -> int:
+    """Stamp (ns) of the view after a move that takes so many seconds, at least 0.1 s later."""
+    return stamp + max(round(seconds * NANOSECONDS), NANOSECONDS // 10)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from active6d_bringup.graph.episode import EpisodeResult, EpisodeSettings, EpisodeStep
     from active6d_core.metrics import SceneScore
 
+_CAMERA = "Simulated camera: flying, or arm for one at the wrist of a simulated arm."
 _ESTIMATOR = "Estimator of the poses in each view: auto, {estimators}; by default that of the params file."
 
 
@@ -33,6 +34,8 @@ def episode(
     policy: Annotated[str, typer.Option(help="Policy that chooses the views: auto, {policies}.")] = "auto",
     steps: Annotated[int, typer.Option(min=0, help="Budget of moves T; T moves give T + 1 views.")] = 5,
     metres: Annotated[float | None, typer.Option(min=0.0, help="Travel budget in metres along the hemisphere.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="Budget of seconds of motion.")] = None,
+    camera: Annotated[str, typer.Option(help=_CAMERA)] = "flying",
     estimator: Annotated[str | None, typer.Option(help=_ESTIMATOR)] = None,
     scene: Annotated[
         str | None,
@@ -56,9 +59,7 @@ def episode(
 
     Example: [bold]active6d episode --object mug --seed 7 --policy lowest-score --steps 5 --bag bags/mug[/bold]
     """
-    if bag is None and (report is not None or figure is not None):
-        option = "--report" if report is not None else "--figure"
-        raise ValueError(f"{option} needs --bag, because it is made from the bag")
+    _check_reports(bag, report, figure)
     with messages.status("starting"):
         from active6d_bringup.graph.composition import check_parameters
         from active6d_bringup.graph.episode import EpisodeSettings
@@ -70,6 +71,8 @@ def episode(
             policy=policy,
             steps=steps,
             metres=metres,
+            seconds=seconds,
+            carrier=camera,
             estimator=estimator,
             sensor=sensor,
             bag=bag,
@@ -82,12 +85,19 @@ def episode(
     result = _run(settings)
     summary = _summary(result)
     _print_summary(result, summary)
-    if bag is not None and (report is not None or figure is not None):
-        _write_reports(bag, report, figure)
+    _write_reports(bag, report, figure)
     write_json(json_file, summary)
 
 
-def _write_reports(bag: Path, report: Path | None, figure: Path | None) -> None:
+def _check_reports(bag: Path | None, report: Path | None, figure: Path | None) -> None:
+    if bag is None and (report is not None or figure is not None):
+        option = "--report" if report is not None else "--figure"
+        raise ValueError(f"{option} needs --bag, because it is made from the bag")
+
+
+def _write_reports(bag: Path | None, report: Path | None, figure: Path | None) -> None:
+    if bag is None or (report is None and figure is None):
+        return
     from active6d_bringup.bags.reader import read_episode
     from active6d_tools.report.analysis import analyse
 
@@ -102,11 +112,13 @@ def _check_names(settings: "EpisodeSettings") -> None:
     from active6d_core.registry import AUTOMATIC
     from active6d_perception.estimators.registry import list_estimators
     from active6d_sim.rendering.sensor_registry import list_sensors
+    from active6d_sim.robot.arm import CARRIERS
 
     load_object(settings.object)
     for option, value, known in (
         ("--policy", settings.policy, [AUTOMATIC, *list_policies()]),
         ("--estimator", settings.estimator, [AUTOMATIC, *list_estimators()]),
+        ("--camera", settings.carrier, CARRIERS),
         ("--sensor", settings.sensor, [AUTOMATIC, *list_sensors()]),
     ):
         if value is not None and value not in known:
@@ -172,6 +184,8 @@ def _summary(result: "EpisodeResult") -> dict[str, Any]:
         "end_reason": result.reason,
         "distance_m": result.distance,
         "seconds": result.seconds,
+        "motion_seconds": result.motion_seconds,
+        "refused": result.refused,
         "objects_true": len(last.detected) if last else None,
         "detection_rate": last.detection_rate if last else None,
         "e_add_mm": last.mean_e_add_mm if last else None,
@@ -192,7 +206,8 @@ def _summary(result: "EpisodeResult") -> dict[str, Any]:
 
 
 def _print_summary(result: "EpisodeResult", summary: dict[str, Any]) -> None:
-    moves = f"{summary['moves']} moves, {result.distance:.2f} m, {result.seconds:.1f} s"
+    moves = f"{summary['moves']} moves, {result.distance:.2f} m, {result.motion_seconds:.1f} s of motion"
+    moves += f", {result.seconds:.1f} s of computation"
     rows = [("episode", f"{summary['scene'] or result.settings.object}, {summary['policy']}: {moves}")]
     rows.append(("ended", result.reason))
     if summary["objects_true"] is None:
@@ -200,6 +215,7 @@ def _print_summary(result: "EpisodeResult", summary: dict[str, Any]) -> None:
     else:
         found = f"{summary['detection_rate'] * summary['objects_true']:.0f} of {summary['objects_true']}"
         rows.append(("found", f"{found} ({summary['detection_rate']:.0%}), mean ADD {summary['e_add_mm']:.1f} mm"))
+    rows += [("refused", reason) for reason in result.refused]
     rows += [("event", event) for event in result.events if not event.startswith("starting ")]
     if result.settings.bag is not None:
         rows.append(("bag", str(result.settings.bag)))
