@@ -17,7 +17,10 @@ os.environ["OMP_NUM_THREADS"] = "1"
 STARTS_NODES = {"test_episode", "test_graph_loop", "test_processes", "test_cli_episode", "test_graph_benchmark"}
 # Must be set before the first rclpy import.
 os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+from active6d_core.ros.network import keep_on_this_machine  # noqa: E402
+
+keep_on_this_machine()
 
 
 @pytest.fixture

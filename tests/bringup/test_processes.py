@@ -82,13 +82,7 @@ def test_killed_estimator_comes_back_and_the_episode_ends_as_ever(graphs, tmp_pa
     ("victim", "number"),
     [
         ("episode_recorder", signal.SIGKILL),
-        pytest.param(
-            "pose_estimator",
-            signal.SIGSTOP,
-            marks=pytest.mark.xfail(
-                reason="in 3 of 8 runs the restarted estimator did not answer its view", strict=False
-            ),
-        ),
+        ("pose_estimator", signal.SIGSTOP),
     ],
 )
 def test_killed_recorder_and_hung_estimator_come_back(graphs, tmp_path, victim, number):

@@ -21,6 +21,7 @@ from active6d_core.ros.network import (
     domain_of,
     is_used,
     keep_on_this_machine,
+    open_to_network,
 )
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.publishers import live_publishers, others_in_domain
@@ -40,15 +41,18 @@ for kind in ("udp", "udp6", "tcp", "tcp6"):
     for line in open(f"/proc/net/{kind}").readlines()[1:]:
         if line.split()[9] in own:
             print(kind, line.split()[1])
+print("mapped", sum("/dev/shm/fastrtps" in line for line in open("/proc/self/maps")))
 """
 
 
 def sockets(environment, domain):
-    """(address, port) of the sockets of a process with one node."""
+    """(address, port) of the sockets of a process with one node, which has no shared memory."""
     clean = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_AUTO", "FASTRTPS"))}
     command = [sys.executable, "-c", SOCKETS, str(domain)]
     output = subprocess.run(command, env={**clean, **environment}, capture_output=True, text=True, check=True).stdout
-    return [(line.split()[1].split(":")[0], int(line.split(":")[1], 16)) for line in output.splitlines()]
+    *lines, mapped = output.splitlines()
+    assert mapped == "mapped 0", "a killed process leaves ports in shared memory that its successor may not get"
+    return [(line.split()[1].split(":")[0], int(line.split(":")[1], 16)) for line in lines]
 
 
 def test_what_receives_is_bound_to_the_loopback_interface_only():
@@ -59,6 +63,16 @@ def test_what_receives_is_bound_to_the_loopback_interface_only():
     assert len(receiving) >= 2
     assert {address for address, _ in receiving} == {"0100007F"}
     assert describe_reach(environment) == "on this machine only"
+    environment = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+    keep_on_this_machine(environment)
+    assert environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"  # other middleware does not read the profile
+
+
+def test_a_graph_on_the_network_has_sockets_only():
+    environment = {}
+    open_to_network(environment)
+    assert "00000000" in {address for address, _ in sockets(environment, fresh_domain())}
+    assert describe_reach(environment) == "from the network"
 
 
 def test_what_the_user_set_is_kept_and_described():

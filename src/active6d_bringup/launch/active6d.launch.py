@@ -14,7 +14,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 from active6d_core.object_model import load_object
 from active6d_core.ros.graph_nodes import BAD_PARAMETERS, MAX_RESTARTS, NODES
-from active6d_core.ros.network import keep_on_this_machine
+from active6d_core.ros.network import keep_on_this_machine, open_to_network
 
 SHARE = Path(get_package_share_directory("active6d_bringup"))
 
@@ -40,7 +40,7 @@ ARGUMENTS = {
     "rate": ("", None, "speed of playing against the recording; 0.0: as fast as perception; empty: as in params_file"),
     "record": ("false", ["true", "false"], "record every topic of the graph"),
     "bag": ("", None, "folder of the recorded bag, with record:=true; empty: as in params_file"),
-    "network": ("false", ["true", "false"], "let other machines reach the nodes; false: 127.0.0.1 and shared memory"),
+    "network": ("false", ["true", "false"], "let other machines reach the nodes; false: 127.0.0.1 only"),
     "rviz": ("false", ["true", "false"], "show the graph in RViz"),
 }
 
@@ -127,8 +127,8 @@ def _wanted(given: dict[str, str]) -> set[str]:
 def _graph(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     _refuse_what_cannot_work(given)
-    if given["network"] == "false":
-        keep_on_this_machine(context.environment)
+    reach = open_to_network if given["network"] == "true" else keep_on_this_machine
+    reach(context.environment)
     nodes = [_node(executable, given) for executable in NODES if executable in _wanted(given)]
     if given["rviz"] == "true":
         layout = str(SHARE / "rviz" / "active6d.rviz")

@@ -11,7 +11,9 @@ from typing import IO
 #: Fast DDS takes its default transports from the file that this names.
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-#: Binds all sockets to 127.0.0.1; the discovery range alone leaves them bound to every interface.
+#: Without shared memory, whose ports do not always survive a killed process.
+TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
+#: Binds all sockets to 127.0.0.1; the discovery range alone leaves them bound to every interface, and adds shared memory.
 LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
 # DDS derives ports from the domain; those of domains above 101 collide with the ones Linux hands out.
 _LAST_DOMAIN = 101
@@ -23,9 +25,17 @@ class DomainError(ValueError):
 
 
 def keep_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Restrict what is started with this environment to 127.0.0.1 and shared memory, as far as nothing else is set."""
-    environment.setdefault(RANGE, "LOCALHOST")
-    environment.setdefault(PROFILES, str(LOOPBACK_PROFILE))
+    """Restrict what is started with this environment to 127.0.0.1, as far as nothing else is set."""
+    fast_dds = "fastrtps" in environment.get("RMW_IMPLEMENTATION", "fastrtps")
+    if fast_dds and environment.setdefault(PROFILES, str(LOOPBACK_PROFILE)) == str(LOOPBACK_PROFILE):
+        environment[RANGE] = "SYSTEM_DEFAULT"  # as the profile says; every other range adds to it
+    else:
+        environment.setdefault(RANGE, "LOCALHOST")
+
+
+def open_to_network(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Let other machines reach what is started with this environment, by UDP alone if nothing else is set."""
+    environment.setdefault(TRANSPORTS, "UDPv4")
 
 
 def describe_reach(environment: MutableMapping[str, str] = os.environ) -> str:

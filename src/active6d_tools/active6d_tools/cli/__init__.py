@@ -9,7 +9,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from active6d_core.interrupts import INTERRUPTED
-from active6d_core.ros.network import keep_on_this_machine
+from active6d_core.ros.network import keep_on_this_machine, open_to_network
 from active6d_tools.cli import (
     ablate,
     bags,
@@ -113,8 +113,7 @@ def show_help(
         os.environ["ACTIVE6D_TRACEBACK"] = "1"
     if outside:
         os.environ["ACTIVE6D_ALLOW_OUTSIDE"] = "1"
-    if not network:
-        keep_on_this_machine()
+    (open_to_network if network else keep_on_this_machine)()
     if ctx.invoked_subcommand is None:
         typer.echo(ctx.get_help())
 
