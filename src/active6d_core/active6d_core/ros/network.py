@@ -13,7 +13,7 @@ PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 #: Without shared memory, whose ports do not always survive a killed process.
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"
-#: Binds all sockets to 127.0.0.1; the discovery range alone leaves them bound to every interface, and adds shared memory.
+#: Binds all sockets to 127.0.0.1; the discovery range alone leaves them on every interface, and adds shared memory.
 LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
 # DDS derives ports from the domain; those of domains above 101 collide with the ones Linux hands out.
 _LAST_DOMAIN = 101
