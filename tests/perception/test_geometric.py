@@ -31,6 +31,11 @@ NAMES = ("coffee_cup", "bunny", "mug")
 
 
 @lru_cache
+def geometric(name):
+    return create_estimator("geometric", load_object(name))
+
+
+@lru_cache
 def dropped(model, seed, count):
     return simulate_heap(model, seed, count=count)
 
@@ -53,10 +58,9 @@ def test_finds_a_lone_object(name):
     model = load_object(name)
     # Without symmetry the mug needs its handle in the picture: ADD-S says that the body is found from anywhere.
     error = add_s if name == "mug" else e_add
-    estimator = create_estimator("geometric", model)
     for labelled in captures(model, (43, 67), seed=3, count=1):
         view = labelled.view
-        found = estimator.estimate(view)
+        found = geometric(name).estimate(view)
         truth = invert(view.T_world_camera) @ labelled.T_world_object
         best = found.score.argmax()
         assert error(model, found.T_camera_object[best], truth[0]) < 0.1 * model.diameter
@@ -68,18 +72,22 @@ def test_finds_a_lone_object(name):
 @pytest.mark.parametrize(("name", "found"), [("coffee_cup", 0.95), ("bunny", 0.95), ("mug", 0.95)])
 def test_finds_most_of_what_a_heap_shows(name, found):
     model = load_object(name)
-    result = evaluate_estimator(create_estimator("geometric", model), model, captures(model, (45, 70), seed=11))
+    result = evaluate_estimator(geometric(name), model, captures(model, (45, 70), seed=11))
     assert result.detection_rate(0.5, "adds") >= found
-    is_right = result.right("adds")
-    assert is_right.mean() > 0.9
+    is_right, sure = result.right("adds"), result.gather("score") >= 0.5
+    assert is_right[sure].mean() > 0.95
     assert result.gather("verification")[is_right].mean() > 0.8
 
 
 def test_is_deterministic_and_looks_at_depth_only():
     model = load_object("bunny")
-    view = captures(model, (50,), seed=11)[0].view
+    view = captures(model, (50,), seed=3, count=1)[0].view
     elsewhere = View(view.stamp + 5, 255 - view.color, view.depth, view.camera, np.eye(4))
-    results = [create_estimator("geometric", model).estimate(seen) for seen in (view, elsewhere)]
+    results = [
+        each.estimate(seen)
+        for each, seen in ((geometric("bunny"), view), (create_estimator("geometric", model), elsewhere))
+    ]
+    assert len(results[0])
     for name in ("T_camera_object", "score", "box", "depth", "label", "segmentation"):
         np.testing.assert_array_equal(getattr(results[0], name), getattr(results[1], name))
 
@@ -89,14 +97,14 @@ def test_nothing_to_see(depth):
     model = load_object("mug")
     view = captures(model, (50,), seed=3, count=1)[0].view
     blank = View(1, view.color, np.full_like(view.depth, depth), view.camera, view.T_world_camera)
-    assert len(create_estimator("geometric", model).estimate(blank)) == 0
+    assert len(geometric("mug").estimate(blank)) == 0
 
 
 def test_noise_in_all_of_space_costs_no_more_than_a_heap():
     depth = np.random.default_rng(0).uniform(0.3, 1.5, (240, 320)).astype(np.float32)
     camera = PinholeCamera.from_field_of_view(320, 240, 60.0)
     view = View(1, np.zeros((240, 320, 3), np.uint8), depth, camera, np.eye(4))
-    estimator = create_estimator("geometric", load_object("mug"))
+    estimator = geometric("mug")
     tracemalloc.start()
     try:
         estimator.estimate(view)
@@ -107,7 +115,7 @@ def test_noise_in_all_of_space_costs_no_more_than_a_heap():
 
 def test_more_views_find_more():
     model = load_object("coffee_cup")
-    rates = detection_over_views(create_estimator("geometric", model), model, [captures(model, (5, 52, 77), seed=11)])
+    rates = detection_over_views(geometric("coffee_cup"), model, [captures(model, (5, 52, 77), seed=11)])
     assert rates.shape == (1, 3)
     assert rates[0, -1] > rates[0, 0]
 

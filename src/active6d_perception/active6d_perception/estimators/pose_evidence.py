@@ -29,7 +29,7 @@ class Judge(NamedTuple):
 
 
 @compiled
-def weigh_poses(T: np.ndarray, judge: Judge, image: MeasuredImage) -> np.ndarray:
+def weigh_poses(T: np.ndarray, judge: Judge, image: MeasuredImage, outlined: bool = True) -> np.ndarray:
     """The evidence of a depth image for poses.
 
     A sample fits by degrees: fully where depth and normal agree, less towards the tolerance. With a plain count, wrong
@@ -39,6 +39,7 @@ def weigh_poses(T: np.ndarray, judge: Judge, image: MeasuredImage) -> np.ndarray
         T: (k, 4, 4) ``T_camera_object``, metres.
         judge: samples and outline of the object, and tolerances.
         image: what was measured.
+        outlined: whether to look beyond the outline; if not, its shares are 0.
 
     Returns:
         (k, 7) with the columns :data:`EVIDENCE`. Of the visible samples, the shares that fit, that the camera looked
@@ -49,7 +50,8 @@ def weigh_poses(T: np.ndarray, judge: Judge, image: MeasuredImage) -> np.ndarray
     for k in range(len(T)):
         direction = direction_of(T[k], judge.samples.nearest)
         _weigh_surface(T[k], direction, judge, image, result[k])
-        _weigh_outline(T[k], direction, judge, image, result[k])
+        if outlined:
+            _weigh_outline(T[k], direction, judge, image, result[k])
     return result
 
 

@@ -49,19 +49,26 @@ def length_scale(model: ObjectModel) -> float:
     return float(np.clip(model.diameter / _REFERENCE_DIAMETER, *_SCALES))
 
 
-def judge_of(model: ObjectModel, part: np.ndarray | None = None, samples: int = _SAMPLES) -> Judge:
+def judge_of(
+    model: ObjectModel,
+    part: np.ndarray | None = None,
+    samples: int = _SAMPLES,
+    tolerance: float = _TOLERANCE,
+    alike: float = _ALIKE,
+) -> Judge:
     """What poses of an object are judged by.
 
     Args:
         model: the object.
         part: (s,) bool, the samples of :func:`.model_views` to judge by; None for all.
         samples: largest number for each view direction.
+        tolerance: metres, for an object of 0.14 m; see :class:`.Judge`.
+        alike: least cosine between normals of a fitting sample.
     """
     views = model_views(model)
     part = np.ones(len(views.points), bool) if part is None else part
-    tolerance, beyond = _TOLERANCE * length_scale(model), _BEYOND * model.diameter
     chosen = visible_samples(views, part, samples, model.mesh.area)
-    return Judge(chosen, outline_of(model), tolerance, _ALIKE, beyond)
+    return Judge(chosen, outline_of(model), tolerance * length_scale(model), alike, _BEYOND * model.diameter)
 
 
 class PoseSelection:

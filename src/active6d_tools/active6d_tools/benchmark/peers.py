@@ -18,7 +18,6 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, make_transform
 from active6d_perception.estimators.geometric.foreground import Surface, measure_surface
 from active6d_perception.estimators.masks import claim_pixels
-from active6d_perception.estimators.measured_image import measure_image
 from active6d_perception.estimators.pose_evidence import NEAR, OCCLUDED, VIOLATED, weigh_poses
 from active6d_perception.estimators.pose_selection import judge_of
 from active6d_perception.estimators.registry import Estimator
@@ -46,7 +45,7 @@ class DepthCheck:
 
     def report(self, T_camera_object: np.ndarray, surface: Surface, view: View) -> Hypotheses:
         """The accepted ones of (k, 4, 4) candidates, without duplicates, scored by the share of surface that fits."""
-        evidence = weigh_poses(T_camera_object, self._judge, measure_image(view.depth, view.camera))
+        evidence = weigh_poses(T_camera_object, self._judge, surface.image)
         fitting, violated = evidence[:, NEAR], evidence[:, VIOLATED]
         open_to_view = np.maximum(1.0 - evidence[:, OCCLUDED], 1e-6)
         accepted = np.flatnonzero(
@@ -58,7 +57,7 @@ class DepthCheck:
         score = np.clip(fitting - violated, 0.0, 1.0)[accepted]
         kept = suppress(self._distance.between(poses, poses), score, 0.15 * self._model.diameter)
         poses, score = poses[kept], score[kept]
-        label = claim_pixels(self._views, poses, surface.points, surface.foreground, view.camera)
+        label = claim_pixels(self._views, poses, surface.image.points, surface.foreground, view.camera)
         claimed = np.unique(label[label > 0])
         if not len(claimed):
             return Hypotheses.empty(view.camera.height, view.camera.width)
@@ -231,8 +230,8 @@ def _projected(T: np.ndarray) -> np.ndarray:
 
 def _scene_cloud(surface: Surface, spacing: float) -> o3d.geometry.PointCloud:
     """Foreground points and their normals, thinned out to ``spacing`` metres."""
-    usable = surface.foreground & np.isfinite(surface.normals).all(axis=-1)
-    cloud = _cloud(surface.points[usable], surface.normals[usable]).voxel_down_sample(spacing)
+    usable = surface.foreground & np.isfinite(surface.image.normals).all(axis=-1)
+    cloud = _cloud(surface.image.points[usable], surface.image.normals[usable]).voxel_down_sample(spacing)
     return cloud.normalize_normals()
 
 

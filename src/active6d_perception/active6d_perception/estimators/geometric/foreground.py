@@ -1,10 +1,11 @@
-"""From a depth image to smoothed points, normals and a mask of the foreground (not table, floor or bin wall)."""
+"""The measured surface of a depth image, and which of it is foreground (not table, floor or bin wall)."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from active6d_core.camera import PinholeCamera, backproject, normals_from_points
+from active6d_core.camera import PinholeCamera
+from active6d_perception.estimators.measured_image import MeasuredImage, measure_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -12,60 +13,30 @@ class Surface:
     """The measured surface of one view, in the optical frame.
 
     Attributes:
-        camera: intrinsics of all images.
-        depth: (H, W) smoothed metres, NaN invalid.
-        points: (H, W, 3) metres, NaN invalid.
-        normals: (H, W, 3) unit normals facing the camera, NaN where unknown.
+        camera: intrinsics.
+        image: points and normals.
         foreground: (H, W) bool, whether a pixel has depth and lies on no large plane.
     """
 
     camera: PinholeCamera
-    depth: np.ndarray
-    points: np.ndarray
-    normals: np.ndarray
+    image: MeasuredImage
     foreground: np.ndarray
 
 
 def measure_surface(depth: np.ndarray, camera: PinholeCamera, object_diameter: float) -> Surface:
-    """Smooth a depth image within surfaces but not across edges, and separate bin and table from the foreground.
+    """Points and normals of a depth image, and its foreground.
 
     Args:
         depth: (H, W) metres along z, NaN invalid.
         camera: intrinsics.
         object_diameter: metres; planes larger than any face of an object are background.
     """
-    smooth = smooth_within_surfaces(smooth_within_surfaces(depth.astype(np.float32), axis=0), axis=1)
-    points = backproject(smooth, camera)
-    normals = normals_from_points(points, reach=3)
-    foreground = np.isfinite(smooth)
-    for normal, offset in find_large_planes(points, normals, object_diameter):
+    image = measure_image(depth, camera)
+    foreground = np.isfinite(image.points[..., 2])
+    for normal, offset in find_large_planes(image.points, image.normals, object_diameter):
         # Only surface with the plane's normal is background, because the plane of a wall may cut through objects.
-        foreground &= ~((np.abs(points @ normal - offset) < 0.006) & (normals @ normal > 0.8))
-    return Surface(camera, smooth, points, normals, foreground)
-
-
-def smooth_within_surfaces(depth: np.ndarray, axis: int, reach: int = 2, gate: float = 0.008) -> np.ndarray:
-    """Smooth along one axis: the mean of neighbours whose depth differs by less than ``gate``.
-
-    Args:
-        depth: (H, W) float32 metres, NaN invalid; invalid pixels stay invalid.
-        axis: 0 down the columns, 1 along the rows.
-        reach: how far neighbours may be away, pixels.
-        gate: largest difference in depth, metres.
-    """
-    total, count = depth.copy(), np.ones(depth.shape, np.float32)
-    for shift in range(1, reach + 1):
-        ahead = [slice(None), slice(None)]
-        behind = ahead.copy()
-        ahead[axis], behind[axis] = slice(shift, None), slice(None, -shift)
-        difference = depth[tuple(ahead)] - depth[tuple(behind)]
-        same = np.abs(difference) < gate  # false where either is NaN
-        difference[~same] = 0.0
-        total[tuple(behind)] += same * depth[tuple(behind)] + difference
-        total[tuple(ahead)] += same * depth[tuple(ahead)] - difference
-        count[tuple(behind)] += same
-        count[tuple(ahead)] += same
-    return total / count
+        foreground &= ~((np.abs(image.points @ normal - offset) < 0.006) & (image.normals @ normal > 0.8))
+    return Surface(camera, image, foreground)
 
 
 def find_large_planes(

@@ -6,43 +6,62 @@ from pathlib import Path
 
 import numpy as np
 
-from active6d_core.camera import View
+from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.geometric.foreground import Surface, measure_surface
-from active6d_perception.estimators.geometric.multi_start import (
-    Starts,
-    compare,
-    image_of,
-    refine_projectively,
-    samples_of,
-    thin_out,
-)
+from active6d_perception.estimators.geometric.multi_start import Starts, thin_out
 from active6d_perception.estimators.geometric.pair_voting import PairVoting
+from active6d_perception.estimators.image_registration import register
 from active6d_perception.estimators.masks import claim_pixels
-from active6d_perception.estimators.measured_image import MeasuredImage
+from active6d_perception.estimators.pose_evidence import (
+    CONFIRMED,
+    CONTINUED,
+    FITTING,
+    NEAR,
+    OCCLUDED,
+    UNKNOWN,
+    VIOLATED,
+    weigh_poses,
+)
+from active6d_perception.estimators.pose_selection import judge_of, length_scale
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.estimators.score_model import ScoreModel
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
+from active6d_perception.model.visible_samples import visible_samples
 
-# Diameter for which the lengths below are given; they scale with the object, within what depth sensors resolve.
-_REFERENCE_DIAMETER = 0.14
-_SCALES = (0.35, 1.5)
+# Gates of the two registrations in metres, for an object of 0.14 m.
+_ROUGH_GATES = np.array([0.02, 0.012])
+_FINE_GATES = np.array([0.012, 0.008, 0.006])
 # Weight of a sample that the camera looked through against one that fits.
 _VIOLATION = 1.5
+# Share of a pose's surface that features are given over, at least.
+_LEAST_COMPARABLE = 0.1
 # Measured points that are paired with others. A heap shows under four thousand; noise fills all space.
 _MOST_POINTS = 8000
 # Starts kept at each measured point.
 _STARTS_PER_POINT = 24
 # Starts that are refined, those that fit best; it bounds the time of images that no pile shows.
 _MOST_STARTS = 5000
-# A start that fits less than this, net of violations, is dropped.
-_LEAST_VALUE = 0.05
+# A start or candidate that fits less than this, net of violations, is dropped.
+# It is small, because sensors leave out half of some objects.
+_LEAST_VALUE = 0.03
 #: Features of :meth:`GeometricEstimator.candidates`.
-FEATURES = ("fitting", "violated", "fitting_unoccluded", "log_area", "area_share", "area_excess", "log_pixels")
+FEATURES = (
+    "fitting",
+    "violated",
+    "fitting_comparable",
+    "near_comparable",
+    "confirmed",
+    "continued",
+    "log_area",
+    "area_share",
+    "area_excess",
+    "log_pixels",
+)
 #: Features that can only lower the score.
-AGAINST = ("violated", "area_excess")
+AGAINST = ("violated", "continued", "area_excess")
 #: The score's regression, fitted by active6d_tools.studies.fit_geometric_score on validation views of all objects.
 SCORE_FILE = Path(__file__).parent / "score.json"
 
@@ -84,9 +103,14 @@ class GeometricEstimator:
         self._voting = PairVoting(model)
         self._starts = Starts(self._views)
         self._distance = SymmetricDistance(model)
-        self._samples = {count: samples_of(self._views, count) for count in (32, 64, 128, 256)}
+        # The fewer poses are left, the more samples each is judged by, and the more strictly.
+        self._first = judge_of(model, samples=32, tolerance=0.010, alike=0.5)
+        self._second = judge_of(model, samples=64, tolerance=0.008, alike=0.6)
+        self._last = judge_of(model)
+        everything = np.ones(len(self._views.points), bool)
+        self._samples = visible_samples(self._views, everything, 128, model.mesh.area)
         self._score = ScoreModel.from_dict(json.loads(SCORE_FILE.read_text()), FEATURES)
-        self._scale = float(np.clip(model.diameter / _REFERENCE_DIAMETER, *_SCALES))
+        self._scale = length_scale(model)
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimators.registry.Estimator.estimate`."""
@@ -105,70 +129,77 @@ class GeometricEstimator:
         """Poses that explain pixels which no better one explains.
 
         Returns:
-            (k, 4, 4) ``T_camera_object``; (H, W) uint16 label image, 1 + index of the pose and 0 for none; and (k, 7)
-            :data:`FEATURES`. Fitting shares are of all samples, and of what is not occluded. The area of the pose's
-            pixels is given over the diameter squared, and over the silhouette's part that is not occluded.
+            (k, 4, 4) ``T_camera_object``; (H, W) uint16 label image, 1 + index of the pose and 0 for none; and (k, f)
+            :data:`FEATURES`: evidence of the depth image, some of it of the surface that is neither occluded nor
+            unknown. The area of the pose's pixels is given over the diameter squared, and over that part's silhouette.
         """
-        image = image_of(surface)
-        poses = self._propose(surface, image)
+        image = surface.image
+        poses = self._propose(surface)
         if len(poses):
-            poses = refine_projectively(poses, self._samples[64], image, self._scale * np.array([0.02, 0.012]), 4)
-            poses = self._thin_out(poses, self._weigh(poses, image, 64, 0.008, 0.6), 0.06, self.parameters.refined, 15)
-            gates = self._scale * np.array([0.012, 0.008, 0.006])
-            poses = refine_projectively(poses, self._samples[128], image, gates, 5)
-            poses = self._thin_out(poses, self._weigh(poses, image, 256, 0.006, 0.7), 0.1, 300, 3)
-        shares = self._weigh(poses, image, 256, 0.006, 0.7)
+            poses = register(poses, self._second.samples, image, self._scale * _ROUGH_GATES, 4, 0)
+            value = _value(weigh_poses(poses, self._second, image, False))
+            poses = self._thin_out(poses, value, 0.06, self.parameters.refined, 15)
+            poses = register(poses, self._samples, image, self._scale * _FINE_GATES, 5, 0)
+            poses = self._thin_out(poses, _value(weigh_poses(poses, self._last, image, False)), 0.1, 300, 3)
+        evidence = weigh_poses(poses, self._last, image)
+        value = _value(evidence)
         # By the area that a pose explains, not by its share: a mug turned so that its handle would be hidden fits
         # perfectly, and leaves the handle that was measured unexplained.
-        area = _value(shares) * self._views.visible.sum(axis=1)[self._views.nearest_direction(poses)]
+        area = value * self._views.visible.sum(axis=1)[self._views.nearest_direction(poses)]
         best = np.argsort(-area, kind="stable")
-        best = best[_value(shares)[best] > 0.1]
-        label = claim_pixels(self._views, poses[best], surface.points, surface.foreground, surface.camera)
+        best = best[value[best] > _LEAST_VALUE]
+        label = claim_pixels(self._views, poses[best], image.points, surface.foreground, surface.camera)
         pixels = np.bincount(label.ravel(), minlength=len(best) + 1)[1:]
         claimed = np.flatnonzero(pixels)
         relabel = np.zeros(len(best) + 1, np.uint16)
         relabel[claimed + 1] = np.arange(1, len(claimed) + 1)
-        poses, shares = poses[best[claimed]], shares[best[claimed]]
+        best = best[claimed]
+        return poses[best], relabel[label], self._features(poses[best], evidence[best], pixels[claimed], surface.camera)
+
+    def _features(
+        self, poses: np.ndarray, evidence: np.ndarray, pixels: np.ndarray, camera: PinholeCamera
+    ) -> np.ndarray:
+        """(k, f) :data:`FEATURES` of (k, 4, 4) poses that claim (k,) pixels."""
         # The area that its pixels cover at the object's distance, in squares of the diameter: the same for all cameras.
-        pixel_area = poses[:, 2, 3] ** 2 / (surface.camera.fx * surface.camera.fy)
-        covered = pixels[claimed] * pixel_area
-        share = covered / self.model.diameter**2
-        silhouette = self._silhouette_area(poses)
-        unoccluded = np.maximum(1.0 - shares[:, 2], 0.1)
-        area_share = covered / (silhouette * unoccluded)
-        features = np.column_stack(
+        covered = pixels * poses[:, 2, 3] ** 2 / (camera.fx * camera.fy)
+        comparable = np.maximum(1.0 - evidence[:, OCCLUDED] - evidence[:, UNKNOWN], _LEAST_COMPARABLE)
+        area_share = covered / (self._silhouette_area(poses) * comparable)
+        return np.column_stack(
             [
-                shares[:, 0],
-                shares[:, 1],
-                shares[:, 0] / unoccluded,
-                np.log(share),
+                evidence[:, FITTING],
+                evidence[:, VIOLATED],
+                evidence[:, FITTING] / comparable,
+                evidence[:, NEAR] / comparable,
+                evidence[:, CONFIRMED],
+                evidence[:, CONTINUED],
+                np.log(covered / self.model.diameter**2),
                 np.minimum(area_share, 1.0),
                 np.maximum(area_share - 1.0, 0.0),
-                np.log(pixels[claimed]),
+                np.log(pixels),
             ]
         )
-        return poses, relabel[label], features
 
-    def _propose(self, surface: Surface, image: MeasuredImage) -> np.ndarray:
+    def _propose(self, surface: Surface) -> np.ndarray:
         """(k, 4, 4) starting poses that the depth image does not contradict."""
-        usable = surface.foreground & np.isfinite(surface.normals).all(axis=-1)
-        index = _one_a_cube(surface, usable, 0.05 * self.model.diameter)
+        image = surface.image
+        usable = surface.foreground & np.isfinite(image.normals).all(axis=-1)
+        index = _one_a_cube(image.points, usable, 0.05 * self.model.diameter)
         if len(index) < 10:
             return np.zeros((0, 4, 4))
         index = index[:: -(-len(index) // _MOST_POINTS)]
-        points = surface.points.reshape(-1, 3)[index].astype(float)
-        normals = surface.normals.reshape(-1, 3)[index].astype(float)
+        points = image.points.reshape(-1, 3)[index].astype(float)
+        normals = image.normals.reshape(-1, 3)[index].astype(float)
         count = min(self.parameters.references, len(points))
         references = np.linspace(0, len(points) - 1, count).astype(np.intp)
         voted, _ = self._voting.candidates(points, normals, references, peaks=3)
         starts = self._starts.at(points[references], normals[references])
-        value = _value(self._weigh(starts.reshape(-1, 4, 4), image, 32, 0.010, 0.5)).reshape(starts.shape[:2])
+        value = _value(weigh_poses(starts.reshape(-1, 4, 4), self._first, image, False)).reshape(starts.shape[:2])
         best = np.argsort(-value, axis=1, kind="stable")[:, :_STARTS_PER_POINT]
         near = np.take_along_axis(starts, best[..., None, None], axis=1).reshape(-1, 4, 4)
         fit = np.take_along_axis(value, best, axis=1).ravel()
         kept = np.flatnonzero(fit > _LEAST_VALUE)
         kept = kept[np.sort(np.argsort(-fit[kept], kind="stable")[:_MOST_STARTS])]
-        voted = voted[_value(self._weigh(voted, image, 32, 0.010, 0.5)) > _LEAST_VALUE]
+        voted = voted[_value(weigh_poses(voted, self._first, image, False)) > _LEAST_VALUE]
         return np.concatenate([near[kept], voted])
 
     def _silhouette_area(self, poses: np.ndarray) -> np.ndarray:
@@ -177,24 +208,20 @@ class GeometricEstimator:
         cosine = np.maximum(self._views.directions[direction] @ self._views.normals.T, 0.0)
         return (self._views.visible[direction] * cosine).sum(axis=1) * np.pi * self._views.spacing**2
 
-    def _weigh(
-        self, poses: np.ndarray, image: MeasuredImage, samples: int, tolerance: float, alike: float
-    ) -> np.ndarray:
-        return compare(poses, self._samples[samples], image, self._scale * tolerance, alike)
-
-    def _thin_out(self, poses: np.ndarray, shares: np.ndarray, radius: float, most: int, quota: int) -> np.ndarray:
+    def _thin_out(self, poses: np.ndarray, value: np.ndarray, radius: float, most: int, quota: int) -> np.ndarray:
         radius *= self.model.diameter
-        return poses[thin_out(poses, _value(shares), self._distance, radius, most=most, quota=quota)]
+        return poses[thin_out(poses, value, self._distance, radius, most=most, quota=quota)]
 
 
-def _value(shares: np.ndarray) -> np.ndarray:
-    return shares[:, 0] - _VIOLATION * shares[:, 1]
+def _value(evidence: np.ndarray) -> np.ndarray:
+    """(k,) net fit of poses, of all their visible surface: what is not measured counts as what does not fit."""
+    return evidence[:, FITTING] - _VIOLATION * evidence[:, VIOLATED]
 
 
-def _one_a_cube(surface: Surface, usable: np.ndarray, spacing: float) -> np.ndarray:
+def _one_a_cube(points: np.ndarray, usable: np.ndarray, spacing: float) -> np.ndarray:
     """Flat indices of usable pixels, about one for each cube of that edge in metres."""
     index = np.flatnonzero(usable)
-    cell = np.floor(surface.points.reshape(-1, 3)[index] / spacing).astype(np.int64)
+    cell = np.floor(points.reshape(-1, 3)[index] / spacing).astype(np.int64)
     key = (cell[:, 0] * 4096 + cell[:, 1]) * 4096 + cell[:, 2]
     _, first = np.unique(key, return_index=True)
     return index[np.sort(first)]
