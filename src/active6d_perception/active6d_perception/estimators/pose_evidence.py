@@ -11,8 +11,8 @@ from active6d_perception.model.surface_grid import SurfaceGrid, nearest_sample
 from active6d_perception.model.visible_samples import VisibleSamples, direction_of
 
 #: Columns of :func:`weigh_poses`.
-EVIDENCE = ("fitting", "violated", "occluded", "near", "unknown", "confirmed", "continued")
-FITTING, VIOLATED, OCCLUDED, NEAR, UNKNOWN, CONFIRMED, CONTINUED = range(len(EVIDENCE))
+EVIDENCE = ("fitting", "violated", "occluded", "near", "unmeasured", "outside", "confirmed", "continued")
+FITTING, VIOLATED, OCCLUDED, NEAR, UNMEASURED, OUTSIDE, CONFIRMED, CONTINUED = range(len(EVIDENCE))
 
 
 class Judge(NamedTuple):
@@ -69,8 +69,11 @@ def _weigh_surface(P: np.ndarray, direction: int, judge: Judge, image: MeasuredI
             x = P[0, 0] * a + P[0, 1] * b + P[0, 2] * c + P[0, 3]
             y = P[1, 0] * a + P[1, 1] * b + P[1, 2] * c + P[1, 3]
             u, v = int(np.rint(x / z * image.fx + image.cx)), int(np.rint(y / z * image.fy + image.cy))
-        if u < 0 or v < 0 or u >= width or v >= height or np.isnan(image.points[v, u, 2]):
-            result[UNKNOWN] += 1
+        if u < 0 or v < 0 or u >= width or v >= height:
+            result[OUTSIDE] += 1
+            continue
+        if np.isnan(image.points[v, u, 2]):
+            result[UNMEASURED] += 1
             continue
         behind = z - image.points[v, u, 2]
         if behind < -2 * tolerance:
@@ -89,7 +92,7 @@ def _weigh_surface(P: np.ndarray, direction: int, judge: Judge, image: MeasuredI
             result[NEAR] += near
             if cosine > alike:
                 result[FITTING] += near * min(1.0, (cosine - alike) / (0.95 - alike))
-    for column in range(UNKNOWN + 1):
+    for column in range(OUTSIDE + 1):
         result[column] /= max(number, 1)
 
 

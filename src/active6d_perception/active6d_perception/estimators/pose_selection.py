@@ -16,7 +16,8 @@ from active6d_perception.estimators.pose_evidence import (
     FITTING,
     NEAR,
     OCCLUDED,
-    UNKNOWN,
+    OUTSIDE,
+    UNMEASURED,
     VIOLATED,
     Judge,
     explained_shares,
@@ -116,7 +117,7 @@ def pose_features(
     """(n, c, f) :data:`FEATURES`; arguments as for :meth:`PoseSelection.value`, judge and grid are the object's."""
     T = np.ascontiguousarray(T_camera_object)
     evidence = weigh_poses(T.reshape(-1, 4, 4), judge, image).reshape(*T.shape[:2], len(EVIDENCE))
-    comparable = np.maximum(1.0 - evidence[..., OCCLUDED] - evidence[..., UNKNOWN], _LEAST_COMPARABLE)
+    comparable = np.maximum(1.0 - evidence[..., [OCCLUDED, UNMEASURED, OUTSIDE]].sum(axis=-1), _LEAST_COMPARABLE)
     shares = evidence[..., [FITTING, VIOLATED, NEAR]] / comparable[..., None]
     explained = explained_shares(T, *of_instances, grid, judge.tolerance)
     return np.concatenate([evidence, shares, explained[..., None]], axis=-1)

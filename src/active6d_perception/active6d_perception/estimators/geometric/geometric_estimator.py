@@ -20,7 +20,8 @@ from active6d_perception.estimators.pose_evidence import (
     FITTING,
     NEAR,
     OCCLUDED,
-    UNKNOWN,
+    OUTSIDE,
+    UNMEASURED,
     VIOLATED,
     weigh_poses,
 )
@@ -45,8 +46,7 @@ _STARTS_PER_POINT = 24
 # Starts that are refined, those that fit best; it bounds the time of images that no pile shows.
 _MOST_STARTS = 5000
 # A start or candidate that fits less than this, net of violations, is dropped.
-# It is small, because sensors leave out half of some objects.
-_LEAST_VALUE = 0.03
+_LEAST_VALUE = 0.05
 #: Features of :meth:`GeometricEstimator.candidates`.
 FEATURES = (
     "fitting",
@@ -162,7 +162,7 @@ class GeometricEstimator:
         """(k, f) :data:`FEATURES` of (k, 4, 4) poses that claim (k,) pixels."""
         # The area that its pixels cover at the object's distance, in squares of the diameter: the same for all cameras.
         covered = pixels * poses[:, 2, 3] ** 2 / (camera.fx * camera.fy)
-        comparable = np.maximum(1.0 - evidence[:, OCCLUDED] - evidence[:, UNKNOWN], _LEAST_COMPARABLE)
+        comparable = np.maximum(1.0 - evidence[:, [OCCLUDED, UNMEASURED, OUTSIDE]].sum(axis=1), _LEAST_COMPARABLE)
         area_share = covered / (self._silhouette_area(poses) * comparable)
         return np.column_stack(
             [
@@ -191,7 +191,7 @@ class GeometricEstimator:
         normals = image.normals.reshape(-1, 3)[index].astype(float)
         count = min(self.parameters.references, len(points))
         references = np.linspace(0, len(points) - 1, count).astype(np.intp)
-        voted, _ = self._voting.candidates(points, normals, references, peaks=3)
+        voted = self._voting.candidates(points, normals, references, peaks=3)
         starts = self._starts.at(points[references], normals[references])
         value = _value(weigh_poses(starts.reshape(-1, 4, 4), self._first, image, False)).reshape(starts.shape[:2])
         best = np.argsort(-value, axis=1, kind="stable")[:, :_STARTS_PER_POINT]
@@ -214,8 +214,9 @@ class GeometricEstimator:
 
 
 def _value(evidence: np.ndarray) -> np.ndarray:
-    """(k,) net fit of poses, of all their visible surface: what is not measured counts as what does not fit."""
-    return evidence[:, FITTING] - _VIOLATION * evidence[:, VIOLATED]
+    """(k,) net fit of poses, of the measured part of their visible surface, or of half of it if less is measured."""
+    measured = np.maximum(1.0 - evidence[:, UNMEASURED], 0.5)
+    return (evidence[:, FITTING] - _VIOLATION * evidence[:, VIOLATED]) / measured
 
 
 def _one_a_cube(points: np.ndarray, usable: np.ndarray, spacing: float) -> np.ndarray:
