@@ -123,7 +123,7 @@ def test_each_kind_of_evidence(cup):
     assert looked_through["violated"] > 0.9
     assert hidden["occluded"] > 0.8
     nothing = np.full_like(depth, np.nan)
-    assert evidence_of(cup, T, nothing)[0]["unknown"] == 1.0
+    assert evidence_of(cup, T, nothing)[0]["unmeasured"] == 1.0
 
 
 def test_the_surface_continues_where_a_ball_lies_in_a_wall(ball):
