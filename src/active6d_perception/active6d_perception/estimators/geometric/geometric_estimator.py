@@ -129,9 +129,11 @@ class GeometricEstimator:
         """Poses that explain pixels which no better one explains.
 
         Returns:
-            (k, 4, 4) ``T_camera_object``; (H, W) uint16 label image, 1 + index of the pose and 0 for none; and (k, f)
-            :data:`FEATURES`: evidence of the depth image, some of it of the surface that is neither occluded nor
-            unknown. The area of the pose's pixels is given over the diameter squared, and over that part's silhouette.
+            poses: (k, 4, 4) ``T_camera_object``, metres.
+            label: (H, W) uint16, 1 + index of the pose and 0 for none.
+            features: (k, f) :data:`FEATURES`. Comparable is the surface that is neither occluded nor unmeasured nor
+                outside of the image. The area of the pose's pixels is given over the diameter squared, and over the
+                silhouette's comparable part.
         """
         image = surface.image
         poses = self._propose(surface)
