@@ -1,7 +1,5 @@
-"""An estimator on images from files: what is read, and the results as BOP CSV rows and overlays."""
+"""An estimator on images from files: what is read, and the results as overlays."""
 
-import csv
-import io
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,11 +18,9 @@ from active6d_core.rgbd import make_view
 from active6d_core.structured_text import read_json
 from active6d_perception.active6d import Active6D
 from active6d_sim.datasets.bop import BopScene
+from active6d_tools.bop_results import BopEstimates
 from active6d_tools.report.drawing import ScoreScale
 from active6d_tools.report.silhouette import SilhouetteDrawer
-
-#: Columns of a results file of the BOP challenge.
-BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +40,12 @@ class ImageResult:
     view: View
     hypotheses: Hypotheses
     seconds: float
+
+    @property
+    def bop(self) -> BopEstimates:
+        """For a results file."""
+        found = self.hypotheses
+        return BopEstimates(self.scene_id, self.image_id, found.T_camera_object, found.score, self.seconds)
 
 
 def read_scene(folder: Path, needs_poses: bool = False) -> tuple[int, list[tuple[int, View]]]:
@@ -107,30 +109,6 @@ def estimate_images(
         except ValueError as error:
             raise ValueError(f"image {image_id}: {error}") from error
         yield ImageResult(scene_id, image_id, view, found, time.perf_counter() - started)
-
-
-def bop_csv(results: Sequence[ImageResult], model: ObjectModel, object_id: int) -> str:
-    """Results as BOP's CSV: poses of the mesh file's frame in the camera, millimetres."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(BOP_COLUMNS)
-    for result in results:
-        T_camera_mesh = model.T_camera_mesh(result.hypotheses.T_camera_object)
-        for T, score in zip(T_camera_mesh, result.hypotheses.score, strict=True):
-            rotation = " ".join(f"{value:.9g}" for value in T[:3, :3].ravel())
-            translation = " ".join(f"{value:.6f}" for value in 1e3 * T[:3, 3])
-            writer.writerow(
-                [
-                    result.scene_id,
-                    result.image_id,
-                    object_id,
-                    f"{score:.6f}",
-                    rotation,
-                    translation,
-                    f"{result.seconds:.4f}",
-                ]
-            )
-    return file.getvalue()
 
 
 def describe(results: Sequence[ImageResult], model: ObjectModel) -> list[dict[str, Any]]:

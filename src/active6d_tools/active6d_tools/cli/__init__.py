@@ -15,6 +15,7 @@ from active6d_tools.cli import (
     bags,
     bank,
     benchmark,
+    benchmark_arm,
     benchmark_estimator,
     benchmark_fusion,
     doctor,
@@ -130,6 +131,7 @@ app.command("list")(list_parts.list_parts)
 app.add_typer(bags.app, name="bag")
 app.add_typer(objects.app, name="object")
 app.add_typer(scenes.app, name="scenes")
+benchmark.app.command(cls=PartsCommand)(benchmark_arm.arm)
 benchmark.app.command(cls=PartsCommand)(benchmark_estimator.estimator)
 benchmark.app.command(cls=PartsCommand)(benchmark_fusion.fusion)
 benchmark.app.command(cls=PartsCommand)(benchmark.pipeline)

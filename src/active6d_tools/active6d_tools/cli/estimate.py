@@ -58,7 +58,8 @@ def estimate(
     import numpy as np
 
     from active6d_perception.active6d import Active6D
-    from active6d_tools.image_estimation import Overlay, bop_csv, describe, estimate_images
+    from active6d_tools.bop_results import bop_csv
+    from active6d_tools.image_estimation import Overlay, describe, estimate_images
 
     if region_in_world and (region is None or folder is None):
         raise ValueError("--region-in-world needs --region and a scene folder with camera poses")
@@ -77,7 +78,7 @@ def estimate(
     )
     results = _draw_each(found, len(images), Overlay(finder.model), out / "overlays", min_score)
     _print(results, min_score)
-    write_file(out / "results.csv", bop_csv(results, finder.model, object_id))
+    write_file(out / "results.csv", bop_csv((result.bop for result in results), finder.model, object_id))
     messages.print(f"wrote {out / 'results.csv'} and {out / 'overlays'}", highlight=False, markup=False)
     write_json(json_file, {"object": object_name, "estimator": estimator, "images": describe(results, finder.model)})
 

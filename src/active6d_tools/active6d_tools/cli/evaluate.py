@@ -1,9 +1,11 @@
 """``active6d evaluate``: policies on a scene bank, as in the paper's Table 1."""
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from active6d_core.files import write_file
 from active6d_tools.cli.options import (
     Banks,
     Imports,
@@ -14,10 +16,11 @@ from active6d_tools.cli.options import (
     Seed,
     Split,
     parse_overrides,
+    recorded_policies,
     usable_policies,
 )
 from active6d_tools.cli.output import write_json
-from active6d_tools.cli.terminal import messages, print_table, progress_bar
+from active6d_tools.cli.terminal import messages, print_table, progress_bar, work_progress
 
 #: A second table compares this policy with the others.
 _DEFAULT = "view-attention"
@@ -32,6 +35,18 @@ def evaluate(
     steps: Annotated[int, typer.Option(min=1, help="Budget of moves T; T moves give T + 1 views.")] = 5,
     split: Split = "test",
     sample: Sample = None,
+    bop: Annotated[
+        Path | None,
+        typer.Option("--bop", metavar="DIR", help="Recorded scenes in BOP's format in place of a bank."),
+    ] = None,
+    object_id: Annotated[int | None, typer.Option(min=1, help="BOP object id of the object, with --bop.")] = None,
+    estimator: Annotated[str, typer.Option(help="Estimator for each recorded image: auto, {estimators}.")] = "auto",
+    first_views: Annotated[
+        int, typer.Option("--starts", min=1, help="First views per recorded scene, with --bop.")
+    ] = 5,
+    csv: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write a BOP results file for each policy, with --bop.")
+    ] = None,
     override: PolicyParameters = None,
     imports: Imports = None,
     banks: Banks = None,
@@ -42,6 +57,25 @@ def evaluate(
 
     Example: [bold]active6d evaluate --object mug --policies all --steps 5 --json mug.json[/bold]
     """
+    parameters = parse_overrides(override or [])
+    if bop is not None:
+        settings = {"steps": steps, "seed": seed, "object_id": object_id, "starts": first_views, "estimator": estimator}
+        _evaluate_recorded(bop, object_name, policies, parameters, settings, csv, json_file)
+    else:
+        _evaluate_bank(object_name, policies, steps, split, sample, parameters, banks, seed, json_file)
+
+
+def _evaluate_bank(
+    object_name: str,
+    policies: str,
+    steps: int,
+    split: str,
+    sample: int | None,
+    parameters: dict[str, dict[str, Any]],
+    banks: Path | None,
+    seed: int,
+    json_file: Path | None,
+) -> None:
     from active6d_agent.bank.batched_fusion import BatchedFusion
     from active6d_agent.bank.scene_bank import find_bank, load_bank
     from active6d_agent.evaluation.policy_evaluation import all_starts, summarise
@@ -53,7 +87,6 @@ def evaluate(
     bank = load_bank(find_bank(object_name, split, banks))
     if steps >= len(bank.sphere):
         raise ValueError(f"--steps {steps}: the grid of {len(bank.sphere)} views leaves {len(bank.sphere) - 1} moves")
-    parameters = parse_overrides(override or [])
     names = usable_policies(policies, bank, parameters)
     with messages.status("reading the bank"):
         lookup = BatchedFusion(bank)
@@ -72,6 +105,44 @@ def evaluate(
         _print_differences(summary)
     provenance = {"split": split, "seed": seed, "bank": bank.provenance, "parameters": parameters}
     write_json(json_file, {**summary, **provenance})
+
+
+def _evaluate_recorded(
+    folder: Path,
+    object_name: str,
+    policies: str,
+    parameters: dict[str, dict[str, Any]],
+    settings: dict[str, Any],
+    csv: Path | None,
+    json_file: Path | None,
+) -> None:
+    from active6d_agent.evaluation.policy_evaluation import summarise
+    from active6d_core.object_model import load_object
+    from active6d_tools.bop_results import bop_csv
+    from active6d_tools.recorded_evaluation import RecordedEvaluation, scene_folders
+
+    model, folders = load_object(object_name), scene_folders(folder)
+    names = recorded_policies(policies, model, parameters)
+
+    def warn(text: str) -> None:
+        messages.print(text, highlight=False, markup=False)
+
+    with messages.status("reading the scenes"):
+        evaluation = RecordedEvaluation(folders, model, **settings, warn=warn)
+    results = {}
+    for name in names:
+        with work_progress() as on_progress:
+            results[name], estimates = evaluation.run(name, parameters.get(name, {}), on_progress)
+        if csv is not None:
+            path = csv / f"{name}_{folder.resolve().name}-test.csv"
+            write_file(path, bop_csv(estimates, model, settings["object_id"] or 1))
+            warn(f"wrote {path}")
+    summary = summarise(results, object_name, settings["steps"], settings["seed"])
+    _print_policies(summary)
+    episodes = {name: {key: own.measures[key].tolist() for key in own.measures} for name, own in results.items()}
+    images = {name: own.views.tolist() for name, own in results.items()}
+    more = {"bop": str(folder), "parameters": parameters, "measures": episodes, "views": images}
+    write_json(json_file, {**summary, **settings, "starts": evaluation.starts.tolist(), **more})
 
 
 def _print_policies(summary: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ from active6d_tools.cli.terminal import messages
 
 if TYPE_CHECKING:
     from active6d_agent.bank.scene_bank import SceneBank
+    from active6d_core.object_model import ObjectModel
 
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results to this JSON file.")]
 Seed = Annotated[int, typer.Option(help="Seed of the random generators.", min=0)]
@@ -104,6 +105,33 @@ def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:
         if overrides[node][parameter] is None:
             raise ValueError(f"--set {text}: the value is empty; an empty text is {name}='\"\"'")
     return overrides
+
+
+def recorded_policies(text: str, model: "ObjectModel", parameters: dict[str, dict[str, Any]]) -> list[str]:
+    """Policies for recorded scenes out of a comma-separated list; ``all`` leaves out those without weights.
+
+    Raises:
+        ValueError: an unknown name, a wrong parameter, or a bound, which needs a bank.
+    """
+    from active6d_agent.evaluation.policy_evaluation import BOUNDS
+    from active6d_agent.policies.registry import create_policy
+    from active6d_core.view_sphere import ViewSphere
+
+    names = [name.strip() for name in (",".join(ALL_POLICIES[: -len(BOUNDS)]) if text == "all" else text).split(",")]
+    usable = []
+    for name in names:
+        if name in BOUNDS:
+            raise ValueError(f"--policies '{name}' is a bound of scene banks, not for recorded scenes")
+        own = {"entropy": [0.0] * len(ViewSphere())} if name == "entropy" else {}
+        try:
+            create_policy(name, model, **{**own, **parameters.get(name, {})})
+        except ValueError as error:
+            if text != "all":
+                raise
+            messages.print(f"left out: {error}", highlight=False, markup=False)
+            continue
+        usable.append(name)
+    return usable
 
 
 def usable_policies(text: str, bank: "SceneBank", parameters: dict[str, dict[str, Any]]) -> list[str]:

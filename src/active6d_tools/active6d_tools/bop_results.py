@@ -1,0 +1,46 @@
+"""Results files of the BOP challenge: one CSV row for each estimated pose."""
+
+import csv
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from active6d_core.object_model import ObjectModel
+
+#: Columns of a results file of the BOP challenge.
+BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+
+
+@dataclass(frozen=True, eq=False)
+class BopEstimates:
+    """Poses estimated in one image.
+
+    Attributes:
+        scene_id: BOP's number of the scene.
+        image_id: BOP's number of the image.
+        T_camera_object: (k, 4, 4) in the optical frame, metres.
+        score: (k,) in [0, 1].
+        seconds: of the estimation.
+    """
+
+    scene_id: int
+    image_id: int
+    T_camera_object: np.ndarray
+    score: np.ndarray
+    seconds: float
+
+
+def bop_csv(estimates: Iterable[BopEstimates], model: ObjectModel, object_id: int) -> str:
+    """Results as BOP's CSV: poses of the mesh file's frame in the camera, millimetres."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(BOP_COLUMNS)
+    for image in estimates:
+        for T, score in zip(model.T_camera_mesh(image.T_camera_object), image.score, strict=True):
+            rotation = " ".join(f"{value:.9g}" for value in T[:3, :3].ravel())
+            translation = " ".join(f"{value:.6f}" for value in 1e3 * T[:3, 3])
+            numbers = [image.scene_id, image.image_id, object_id, f"{score:.6f}"]
+            writer.writerow([*numbers, rotation, translation, f"{image.seconds:.4f}"])
+    return file.getvalue()

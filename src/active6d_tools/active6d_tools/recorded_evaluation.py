@@ -1,0 +1,175 @@
+"""Policies on scenes recorded in BOP's format: which scenes, from which starts, and how they score."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+
+from active6d_agent.bank.scene_bank import view_entropy
+from active6d_agent.environment.rollout import EpisodeResults
+from active6d_agent.policies.episode_state import Limits
+from active6d_agent.policies.registry import create_policy
+from active6d_core.camera import backproject
+from active6d_core.metrics import evaluate_scene
+from active6d_core.object_model import ObjectModel
+from active6d_core.registry import AUTOMATIC
+from active6d_core.se3 import invert
+from active6d_sim.datasets.bop import CAMERA_FILE, BopScene
+from active6d_tools.bop_results import BopEstimates
+from active6d_tools.direct_episode import DirectEpisode, DirectRunner, Perception
+from active6d_tools.recorded_scene import RecordedCamera, RecordedScene, find_bin
+from active6d_tools.view_registration import register_views, upright
+
+#: Objects that are less certain do not help to place an image.
+_SURE = 0.5
+OnProgress = Callable[[str, int, int], None]
+
+
+def scene_folders(folder: Path) -> list[Path]:
+    """Scene folders of a data set, of a split of it, or the folder of a single scene.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for pattern in (CAMERA_FILE, f"*/{CAMERA_FILE}", f"*/*/{CAMERA_FILE}"):
+        found = sorted(path.parent for path in folder.glob(pattern))
+        if found:
+            return found
+    raise ValueError(f"{folder}: no {CAMERA_FILE} in it or in its subfolders; it must be a data set in BOP's format")
+
+
+class RecordedEvaluation:
+    """Runs policies on recorded scenes. Images are estimated once for all of them.
+
+    Args:
+        folders: of the scenes.
+        model: of the object.
+        object_id: BOP's number of the object; None if all objects are of the model.
+        estimator: its name.
+        steps: moves T.
+        starts: number of first views in each scene.
+        seed: of first views and policies.
+        warn: called with what a user should know of a scene.
+
+    Raises:
+        ValueError: a scene cannot be read, placed or scored; the message names it.
+    """
+
+    def __init__(
+        self,
+        folders: Sequence[Path],
+        model: ObjectModel,
+        *,
+        object_id: int | None = None,
+        estimator: str = AUTOMATIC,
+        steps: int = 5,
+        starts: int = 5,
+        seed: int = 0,
+        warn: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._model, self._steps, self._seed = model, steps, seed
+        perception = Perception(model, estimator)
+        self.scenes = []
+        for folder in folders:
+            recording = BopScene.load(folder, needs_poses=False)
+            placed = _place(recording, model, perception, warn)
+            self.scenes.append(RecordedScene(placed, model, object_id, perception, find_bin(placed, model, warn)))
+        self._truths = [scene.truth() for scene in self.scenes]
+        self.starts = np.array(
+            [
+                (number, view)
+                for number, scene in enumerate(self.scenes)
+                for view in self._draw(number, np.unique(scene.nearest[scene.allowed]), starts)
+            ]
+        )
+
+    def _draw(self, number: int, views: np.ndarray, count: int) -> np.ndarray:
+        rng = np.random.default_rng([self._seed, number])
+        return rng.choice(views, min(count, len(views)), replace=False)
+
+    def run(
+        self, name: str, parameters: dict[str, Any], on_progress: OnProgress = lambda what, done, total: None
+    ) -> tuple[EpisodeResults, list[BopEstimates]]:
+        """Run one policy from every start.
+
+        Args:
+            name: of the policy.
+            parameters: of the policy.
+            on_progress: called with a description, the number of episodes done and that of all.
+
+        Returns:
+            The scores; and for each episode the objects in the camera of its last image.
+        """
+        rows, estimates = [], []
+        for done, (number, start) in enumerate(self.starts.tolist()):
+            scene = self.scenes[number]
+            on_progress(f"{name}, {scene.recording.folder.name}", done, len(self.starts))
+            own = {"entropy": self._entropy(scene)} if name == "entropy" else {}
+            policy = create_policy(name, self._model, **{**own, **parameters})
+            camera = RecordedCamera(scene, start)
+            runner = DirectRunner(self._model, Limits(scene.sphere, scene.allowed, self._steps))
+            episode = runner.run(policy, camera, np.random.default_rng([self._seed, number, start]))
+            rows.append(self._score(number, episode, camera))
+            estimates.append(_estimates(scene, episode, camera))
+        return EpisodeResults(self.starts[:, 0], *map(np.array, zip(*rows, strict=True))), estimates
+
+    def _score(self, number: int, episode: DirectEpisode, camera: RecordedCamera) -> tuple[Any, ...]:
+        score = evaluate_scene(self._model, episode.objects[-1].T_world_object, self._truths[number])
+        positions = np.array([seen.view.T_world_camera[:3, 3] for seen in episode.views])
+        taken = camera.taken + [-1] * (self._steps + 1 - len(camera.taken))
+        metres = self.scenes[number].sphere.path_length(positions)
+        return score.detection_rate, score.mean_e_add_mm, metres, taken
+
+    def _entropy(self, scene: RecordedScene) -> np.ndarray:
+        of_image = {int(i): view_entropy(scene.perceive(int(i)).hypotheses.segmentation) for i in set(scene.nearest)}
+        return np.array([of_image[int(i)] for i in scene.nearest])
+
+
+def _estimates(scene: RecordedScene, episode: DirectEpisode, camera: RecordedCamera) -> BopEstimates:
+    objects, index = episode.objects[-1], camera.taken[-1]
+    name = scene.recording.folder.resolve().name
+    return BopEstimates(
+        int(name) if name.isdecimal() else 0,
+        scene.recording.image_ids[index],
+        invert(scene.T_bin_camera[index]) @ objects.T_world_object,
+        objects.score,
+        sum(seen.seconds for seen in episode.views),
+    )
+
+
+def _place(recording: BopScene, model: ObjectModel, perception: Perception, warn: Callable[[str], None]) -> BopScene:
+    """The recording, with camera poses found by the objects in its images where it has none.
+
+    Raises:
+        ValueError: the images cannot be placed.
+    """
+    missing = [np.array_equal(T, np.eye(4)) for T in recording.T_world_camera]
+    if not any(missing):
+        return recording
+    folder = recording.folder
+    if not all(missing):
+        raise ValueError(f"{folder}: {sum(missing)} of {len(missing)} images have no camera pose")
+    centres = []
+    for index in range(len(recording)):
+        found = perception(recording.view(index, index + 1)).hypotheses
+        centres.append(found.T_camera_object[found.score >= _SURE, :3, 3])
+    try:
+        poses = register_views(centres, model.diameter)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from error
+    warn(f"{folder.name}: no camera poses; the {len(poses)} images are placed by the objects in them")
+    return replace(recording, T_world_camera=upright(poses, *_largest_plane(recording)))
+
+
+def _largest_plane(recording: BopScene) -> tuple[np.ndarray, np.ndarray]:
+    """Normal towards the camera, and a point, of the largest plane in the first image, which is taken for the table."""
+    view = recording.view(0, 0)
+    points = backproject(view.depth, view.camera)[np.isfinite(view.depth)][::5].astype(float)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    o3d.utility.random.seed(0)
+    (*normal, offset), _ = cloud.segment_plane(0.004, 3, 1000)
+    normal = np.array(normal) * (1.0 if offset > 0 else -1.0)
+    return normal, -abs(offset) * normal

@@ -1,0 +1,176 @@
+"""A scene recorded in BOP's format as a camera: each goal selects the nearest view (paper, real experiment)."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from active6d_core.camera import PinholeCamera, backproject
+from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import invert, look_at, make_transform, transform_points
+from active6d_core.view_sphere import ViewSphere
+from active6d_perception.model.symmetric_distance import SymmetricDistance
+from active6d_sim.datasets.bop import BopScene
+from active6d_sim.physics.heap import VISIBILITY_THRESHOLD
+from active6d_sim.rendering.simulator import NANOSECONDS, GoalError
+from active6d_tools.direct_episode import PerceivedView, Perception
+
+#: A goal is in reach if a recorded view is at most this far from it, radians.
+_REACH = np.radians(20.0)
+#: True poses in different images that are closer than this fraction of the diameter are one object.
+_SAME_OBJECT = 0.25
+
+
+class RecordedScene:
+    """m recorded views of a scene, each estimated when it is first needed.
+
+    Args:
+        scene: the recording.
+        model: of the objects.
+        object_id: BOP's number of the model; None if all objects are of it.
+        perception: of the object.
+        T_bin_camera: (m, 4, 4) camera poses in the frame of the bin: origin at the middle of its floor, z up.
+
+    Attributes:
+        sphere: the grid of views around the bin, of the cameras' median distance.
+        nearest: (M,) number of the recorded view nearest to each view of the grid.
+        allowed: (M,) bool, views of the grid that a recorded view is near to.
+
+    Raises:
+        ValueError: no recorded view is above the bin.
+    """
+
+    def __init__(
+        self,
+        scene: BopScene,
+        model: ObjectModel,
+        object_id: int | None,
+        perception: Perception,
+        T_bin_camera: np.ndarray,
+    ) -> None:
+        self.recording, self.model, self.T_bin_camera = scene, model, T_bin_camera
+        self._object_id, self._perception = object_id, perception
+        positions = T_bin_camera[:, :3, 3]
+        distance = np.linalg.norm(positions, axis=1)
+        self.sphere = ViewSphere(float(np.median(distance)))
+        cosine = (self.sphere.positions / self.sphere.radius) @ (positions / distance[:, None]).T
+        self.nearest, self.allowed = cosine.argmax(axis=1), cosine.max(axis=1) > np.cos(_REACH)
+        if not self.allowed.any():
+            raise ValueError(f"{scene.folder}: no view is above the bin; is the world's z axis up?")
+        self._known: dict[int, PerceivedView] = {}
+
+    def perceive(self, index: int) -> PerceivedView:
+        """What the estimator finds in the recorded view of this number, boxes turned upright."""
+        if index not in self._known:
+            T = self.T_bin_camera[index]
+            seen = self._perception(replace(self.recording.view(index, index + 1), T_world_camera=T))
+            upright = look_at(T[:3, 3], T[:3, 3] + T[:3, 2])
+            turn = (invert(upright) @ T)[:2, :2]
+            boxes = turn_boxes(seen.hypotheses.box, turn, seen.view.camera)
+            self._known[index] = replace(seen, hypotheses=replace(seen.hypotheses, box=boxes), T_world_shown=upright)
+        return self._known[index]
+
+    def truth(self) -> np.ndarray:
+        """(n, 4, 4) true poses in the bin's frame: those of all images, each object once, if an image shows enough.
+
+        Raises:
+            ValueError: the recording has no ground truth of the object.
+        """
+        apart, found = SymmetricDistance(self.model).between, np.zeros((0, 4, 4))
+        for index, image in enumerate(self.recording.truth or ()):
+            chosen = image.object_id == (image.object_id if self._object_id is None else self._object_id)
+            # Without a record of it, every object counts as visible.
+            chosen &= ~(image.visible_fraction < VISIBILITY_THRESHOLD)
+            poses = self.T_bin_camera[index] @ self.model.T_camera_object(image.T_camera_object[chosen])
+            for T in poses:
+                if not len(found) or apart(T[None], found).min() > _SAME_OBJECT * self.model.diameter:
+                    found = np.concatenate([found, T[None]])
+        if not len(found):
+            raise ValueError(f"{self.recording.folder}: no ground truth of object {self._object_id or self.model.name}")
+        return found
+
+
+class RecordedCamera:
+    """Moves from view to view of a recorded scene.
+
+    Args:
+        scene: the recording.
+        start: number of the first view.
+
+    Attributes:
+        taken: numbers of the views taken, in order.
+    """
+
+    def __init__(self, scene: RecordedScene, start: int) -> None:
+        self._scene, self.taken = scene, [start]
+
+    def begin(self) -> PerceivedView:
+        """The first view."""
+        return self._last()
+
+    def go_to(self, T_world_goal: np.ndarray) -> PerceivedView:
+        """The recorded view nearest in direction.
+
+        Raises:
+            GoalError: it has been taken already.
+        """
+        index = int(self._scene.nearest[self._scene.sphere.nearest(T_world_goal[:3, 3])])
+        if index in self.taken:
+            raise GoalError("the nearest recorded view has been taken already")
+        self.taken.append(index)
+        return self._last()
+
+    def _last(self) -> PerceivedView:
+        return self._scene.perceive(self.taken[-1]).at(len(self.taken) * NANOSECONDS)
+
+
+def turn_boxes(boxes: np.ndarray, turn: np.ndarray, camera: PinholeCamera) -> np.ndarray:
+    """Boxes in the image of the same camera turned about its optical axis.
+
+    Args:
+        boxes: (k, 4) x_min, y_min, x_max, y_max over width and height.
+        turn: (2, 2) rotation of x and y from this camera to the turned one.
+        camera: intrinsics.
+
+    Returns:
+        (k, 4) boxes around the turned corners, clipped to the image.
+    """
+    size, focal = np.array([camera.width, camera.height]), np.array([camera.fx, camera.fy])
+    centre = np.array([camera.cx, camera.cy]) + 0.5
+    corners = boxes[:, [[0, 1], [2, 1], [0, 3], [2, 3]]]
+    turned = ((corners * size - centre) / focal) @ turn.T * focal + centre
+    return np.clip(np.concatenate([turned.min(axis=1), turned.max(axis=1)], axis=1) / np.tile(size, 2), 0.0, 1.0)
+
+
+def find_bin(scene: BopScene, model: ObjectModel, warn: Callable[[str], None] = lambda text: None) -> np.ndarray:
+    """(m, 4, 4) ``T_bin_camera`` of a recording with camera poses: the world is moved to where the cameras look.
+
+    A world whose origin the cameras look at, as this project writes it, stays as it is.
+
+    Raises:
+        ValueError: most cameras look up, so that the world's z axis is not up.
+    """
+    T = scene.T_world_camera
+    if np.median(T[:, 2, 2]) > -0.05:
+        raise ValueError(f"{scene.folder}: the cameras do not look down, so the world's z axis is not up")
+    # The point nearest to all optical axes: projections onto the planes across them.
+    across = np.eye(3) - T[:, :3, 2, None] * T[:, None, :3, 2]
+    middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, T[:, :3, 3]), rcond=None)[0]
+    if np.linalg.norm(middle) < model.diameter:
+        return T
+    floor = _floor(scene, middle, model)
+    shift = np.array([middle[0], middle[1], floor])
+    place = np.round(middle, 3).tolist()
+    warn(f"{scene.folder.name}: the cameras look at {place} m, and the bin's floor is taken to be at {floor:.3f} m")
+    return make_transform(np.eye(3), -shift) @ T
+
+
+def _floor(scene: BopScene, middle: np.ndarray, model: ObjectModel) -> float:
+    """Height of what lies under the objects: a low quantile of the depth around the middle, metres."""
+    heights = []
+    for index in np.unique(np.linspace(0, len(scene) - 1, 5).astype(int)):
+        view = scene.view(int(index), 0)
+        points = transform_points(view.T_world_camera, backproject(view.depth, view.camera)[np.isfinite(view.depth)])
+        near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < model.bin_width / 2
+        heights.append(points[near, 2])
+    return float(np.quantile(np.concatenate(heights), 0.05))

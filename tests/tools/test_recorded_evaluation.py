@@ -1,0 +1,217 @@
+"""`active6d evaluate --bop`: recorded views, scored the same by an independent calculation from the results file."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from hand_made_scenes import SPHERE
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from active6d_core.camera import PinholeCamera, project
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.object_model import load_object
+from active6d_core.se3 import invert, make_transform, rotation_angle, transform_points
+from active6d_perception.estimators.registry import register_estimator
+from active6d_sim.datasets.bop import BopScene, write_bop_scene
+from active6d_sim.datasets.bop_export import write_model
+from active6d_sim.rendering.active_stereo import ActiveStereo
+from active6d_sim.rendering.simulator import Simulator
+from active6d_sim.scenes.scene_store import load_scene
+from active6d_tools.cli import app
+from active6d_tools.direct_episode import Perception
+from active6d_tools.recorded_scene import RecordedScene, find_bin, turn_boxes
+from active6d_tools.view_registration import register_views
+
+CAMERA = PinholeCamera.from_field_of_view(160, 120, 60.0)
+VIEWS = (21, 26, 33, 41, 45, 48, 52, 57, 63, 70, 78, 90)
+#: The recording's world is not the bin's.
+SHIFT = np.array([0.4, -0.3, 0.2])
+MODEL = load_object("mug")
+
+
+@register_estimator("recorded-truth")
+class RecordedTruth:
+    """Finds what the image in the first pixel's number shows at least half of, some of it wrong."""
+
+    poses: dict[int, np.ndarray] = {}  # noqa: RUF012
+
+    def __init__(self, model):
+        pass
+
+    def estimate(self, view):
+        T = self.poses[int(view.color[0, 0, 0])]
+        rng = np.random.default_rng(int(view.color[0, 0, 0]))
+        T = T @ make_transform(
+            Rotation.from_rotvec(rng.normal(0, 0.12, (len(T), 3))).as_matrix(), rng.normal(0, 0.004, (len(T), 3))
+        )
+        middle = project(T[:, :3, 3], CAMERA)
+        box = np.concatenate([middle - 9, middle + 9], axis=1) / np.tile([CAMERA.width, CAMERA.height], 2)
+        labels = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
+        for label, (u, v) in enumerate(middle.astype(int), start=1):
+            labels[max(v - 9, 0) : v + 9, max(u - 9, 0) : u + 9] = label
+        score = rng.uniform(0.6, 1.0, len(T))
+        numbers = np.arange(1, len(T) + 1, dtype=np.uint16)
+        return Hypotheses(T, score, np.clip(box, 0, 1), T[:, 2, 3], numbers, labels)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """A heap in a world that is shifted, taken by cameras that are turned about their optical axes."""
+    folder = tmp_path_factory.mktemp("bop")
+    heap = load_scene("mug", "test", 1)
+    simulator, rng = Simulator(heap, CAMERA, ActiveStereo().scaled(0.0)), np.random.default_rng(0)
+    views = []
+    for number, index in enumerate(VIEWS):
+        turn = Rotation.from_rotvec([0, 0, rng.uniform(-np.pi, np.pi)]).as_matrix()
+        T = SPHERE.pose(SPHERE.positions[index]) @ make_transform(turn, np.zeros(3))
+        view = simulator.capture(T, number + 1)
+        view.color[0, 0] = number
+        seen = heap.visible_fraction[index] > 0.5
+        RecordedTruth.poses[number] = invert(T) @ heap.T_world_object[seen]
+        view.T_world_camera[:3, 3] += SHIFT
+        views.append(view)
+    shifted = make_transform(np.eye(3), SHIFT) @ heap.T_world_object
+    visible = heap.visible_fraction[list(VIEWS)]
+    write_bop_scene(folder / "test" / "000003", views, MODEL.T_camera_mesh(shifted), visible_fraction=visible)
+    write_model(folder / "models", MODEL)
+    return folder
+
+
+def run(*arguments):
+    return CliRunner().invoke(
+        app, ["evaluate", "--object", "mug", "--estimator", "recorded-truth", *map(str, arguments)]
+    )
+
+
+def independent_scores(folder, results):
+    """Detection rate and mean ADD in millimetres from BOP's files, by numpy and trimesh alone."""
+    with results.open() as file:
+        rows = list(csv.DictReader(file))
+    scene = folder / "test" / "000003"
+    cameras, truths = (json.loads((scene / f"scene_{name}.json").read_text()) for name in ("camera", "gt"))
+    surface = np.array(trimesh.load_mesh(folder / "models" / "obj_000001.ply").sample(4000, seed=1))
+    image = cameras[rows[0]["im_id"]]
+    R_w, t_w = np.reshape(image["cam_R_w2c"], (3, 3)), np.array(image["cam_t_w2c"])
+
+    def posed(R, t):
+        return surface @ np.reshape(np.array(R, float), (3, 3)).T + np.array(t, float)
+
+    found = [(posed(row["R"].split(), row["t"].split()) - t_w) @ R_w for row in rows]
+    own = cameras["0"]
+    R_0, t_0 = np.reshape(own["cam_R_w2c"], (3, 3)), np.array(own["cam_t_w2c"])
+    true = [(posed(entry["cam_R_m2c"], entry["cam_t_m2c"]) - t_0) @ R_0 for entry in truths["0"]]
+    infos = json.loads((scene / "scene_gt_info.json").read_text())
+    shown = np.max([[entry["visib_fract"] for entry in infos[image]] for image in infos], axis=0)
+    true = [points for points, most in zip(true, shown, strict=True) if most >= 0.1]
+    errors = np.array([[np.linalg.norm(a - b, axis=1).mean() for b in true] for a in found])
+    errors = np.minimum(errors, 50.0)
+    rows_, columns = linear_sum_assignment(errors)
+    error = np.full(len(true), 50.0)
+    error[columns] = errors[rows_, columns]
+    return (error < 0.1 * 1e3 * MODEL.diameter).mean(), error.mean()
+
+
+def test_the_results_file_scores_the_same_by_an_independent_calculation(dataset, tmp_path):
+    told = tmp_path / "told.json"
+    options = "--policies", "random", "--steps", 3, "--starts", 1, "--csv", tmp_path, "--json", told
+    result = run("--bop", dataset, *options)
+    assert result.exit_code == 0, result.output
+    summary = json.loads(told.read_text())
+    rate, error = independent_scores(dataset, tmp_path / f"random_{dataset.name}-test.csv")
+    assert 0.3 < summary["policies"]["random"]["detection_rate"] < 1.0
+    assert summary["policies"]["random"]["detection_rate"] == pytest.approx(rate, abs=1e-9)
+    assert summary["policies"]["random"]["e_add_mm"] == pytest.approx(error, rel=0.03)
+    (views,) = summary["views"]["random"]
+    assert len(set(views)) == 4
+
+
+def test_scenes_without_camera_poses_are_placed_by_their_objects(dataset, tmp_path):
+    entries = json.loads((dataset / "test" / "000003" / "scene_camera.json").read_text())
+    # The first three are taken from low and share too few objects with the others.
+    entries = {image: entry for image, entry in entries.items() if int(image) > 2}
+    copy = tmp_path / "000003"
+    copy.mkdir()
+    for path in (dataset / "test" / "000003").iterdir():
+        if path.name != "scene_camera.json":
+            (copy / path.name).symlink_to(path)
+    bare = {key: {k: v for k, v in entry.items() if not k.endswith("w2c")} for key, entry in entries.items()}
+    (copy / "scene_camera.json").write_text(json.dumps(bare))
+    result = run("--bop", copy, "--policies", "random", "--steps", 3, "--starts", 1, "--json", tmp_path / "told.json")
+    assert result.exit_code == 0, result.output
+    assert "placed by the objects in them" in result.output
+    bare["4"] |= {key: entries["4"][key] for key in ("cam_R_w2c", "cam_t_w2c")}
+    (copy / "scene_camera.json").write_text(json.dumps(bare))
+    result = run("--bop", copy, "--policies", "random")
+    assert result.exit_code == 2
+    assert "8 of 9 images have no camera pose" in result.output
+
+
+def test_placed_cameras_are_where_they_were(dataset):
+    T = BopScene.load(dataset / "test" / "000003").T_world_camera
+    rng = np.random.default_rng(3)
+    heap = load_scene("mug", "test", 1).T_world_object[:, :3, 3] + SHIFT
+    seen = [rng.permutation(len(heap))[: int(0.7 * len(heap))] for _ in T]
+    centres = [
+        transform_points(invert(pose), heap[own] + rng.normal(0, 0.001, (len(own), 3)))
+        for pose, own in zip(T[:5], seen, strict=False)
+    ]
+    placed = register_views(centres, MODEL.diameter)
+    off = invert(invert(T[0]) @ T[:5]) @ placed
+    assert np.degrees(rotation_angle(off[:, :3, :3], np.eye(3))).max() < 1.5
+    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.015
+    with pytest.raises(ValueError, match="image 1 has no camera pose and cannot be placed by its objects"):
+        register_views([centres[0], rng.uniform(-0.2, 0.2, (9, 3))], MODEL.diameter)
+    with pytest.raises(ValueError, match="it shows 3 objects, and 5 must be shared"):
+        register_views([centres[0], centres[1][:3]], MODEL.diameter)
+
+
+def test_boxes_are_turned_as_a_turned_camera_would_see_them():
+    rng = np.random.default_rng(1)
+    camera = PinholeCamera(64, 48, 55.0, 57.0, 30.7, 24.2)
+    low = rng.uniform(0.3, 0.5, (20, 2))
+    boxes = np.concatenate([low, low + rng.uniform(0.01, 0.15, (20, 2))], axis=1)
+    turn = Rotation.from_rotvec([0, 0, 0.7]).as_matrix()
+    turned = turn_boxes(boxes, turn[:2, :2], camera)
+    size = np.array([64, 48])
+    for box, found in zip(boxes, turned, strict=True):
+        x, y = np.meshgrid(box[[0, 2]] * 64, box[[1, 3]] * 48)
+        rays = np.stack([(x - 31.2) / 55.0, (y - 24.7) / 57.0, np.ones((2, 2))], axis=-1) @ turn.T
+        pixels = (project(rays, camera) + 0.5).reshape(-1, 2) / size
+        np.testing.assert_allclose(found, [*pixels.min(axis=0), *pixels.max(axis=0)], atol=1e-9)
+
+
+def test_the_bin_is_where_the_cameras_look(dataset):
+    scene = BopScene.load(dataset / "test" / "000003")
+    told = []
+    T = find_bin(scene, MODEL, told.append)
+    assert "the cameras look at" in told[0]
+    expected = np.array([SPHERE.positions[index] for index in VIEWS])
+    np.testing.assert_allclose(T[:, :2, 3], expected[:, :2], atol=1e-6)
+    # The floor is hidden under the heap in part; its height is that of what is lowest.
+    assert np.abs(T[:, 2, 3] - expected[:, 2]).max() < 0.02
+    recorded = RecordedScene(scene, MODEL, None, Perception(MODEL, "recorded-truth"), T)
+    assert recorded.sphere.radius == pytest.approx(0.8, abs=0.02)
+    assert len(recorded.truth()) == len(load_scene("mug", "test", 1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("--policies", "oracle"), "is a bound of scene banks"),
+        (("--object-id", 7), "no ground truth of object 7"),
+    ],
+)
+def test_what_cannot_be_scored_is_refused(dataset, arguments, reason):
+    result = run("--bop", dataset, *arguments)
+    assert result.exit_code == 2
+    assert reason in " ".join(result.output.split())
+
+
+def test_a_folder_without_scenes_is_refused(tmp_path):
+    result = run("--bop", tmp_path)
+    assert result.exit_code == 2
+    assert "must be a data set in BOP's format" in " ".join(result.output.split())
