@@ -47,6 +47,7 @@ ON_ROS = {
     "active6d_tools.benchmark.pipeline",
     "active6d_tools.describe_nodes",
     "active6d_tools.graph_doctor",
+    "active6d_tools.studies.compare_adapter",
 }
 IMPORT_BLOCKED = """
 import importlib, sys
