@@ -5,6 +5,7 @@ scene.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,6 +24,7 @@ from active6d_sim.rendering.renderer import SceneRenderer
 from active6d_sim.rendering.sensor_registry import Sensor
 from active6d_sim.scenes.scene import Bin, Scene
 from active6d_sim.scenes.scene_store import load_scene
+from active6d_sim.scenes.shape_variation import vary_shape
 from active6d_sim.scenes.wild_scene import wild_pile
 
 #: Smallest seed of heaps for training; the seeds of stored scenes and of episodes are smaller.
@@ -30,6 +32,8 @@ FIRST_SEED = 1_000_000
 
 _VIEWS_PER_APPEARANCE = 4
 _WILD_SHARE = 0.75
+#: Share of wild scenes whose objects deviate from the mesh, all alike.
+_VARIED_SHARE = 0.5
 #: Widths and heights of images of wild scenes, pixels; one per scene.
 _SIZES = ((640, 480), (640, 480), (640, 360), (512, 424), (720, 540))
 _TRUTH_SCALE = 0.25  # resolution of the truth relative to the view
@@ -99,8 +103,8 @@ def training_views(
 ) -> Iterator[TrainingView]:
     """Simulate views of a scene from random cameras; the appearance changes every few views.
 
-    A wild scene is seen by sensors of all kinds, with errors of calibration, by cameras of any lens and distance. A bin
-    on an empty table is seen by the default sensor with up to twice its noise.
+    A wild scene is seen by sensors of all kinds, with errors of calibration, by cameras of any lens and distance; its
+    objects may deviate from the mesh. A bin on an empty table is seen by the default sensor with up to twice its noise.
 
     Args:
         scene: from :func:`training_scene`.
@@ -110,7 +114,7 @@ def training_views(
         threads: number of threads for ray casting, 0 for one per core.
     """
     wild = scene.surroundings is not None
-    renderer = SceneRenderer(scene, model=model, threads=threads)
+    renderer = SceneRenderer(scene, model=_seen_model(scene, model), threads=threads)
     size = _SIZES[int(rng.integers(len(_SIZES)))] if wild else (640, 480)
     for index in range(count):
         if index % _VIEWS_PER_APPEARANCE == 0:
@@ -122,6 +126,14 @@ def training_views(
             if not wild or _useful(item):
                 break
         yield item
+
+
+def _seen_model(scene: Scene, model: ObjectModel) -> ObjectModel:
+    """The object as it is in the scene: by chance, another shape."""
+    rng = np.random.default_rng([scene.seed, 5])
+    if scene.surroundings is None or rng.random() > _VARIED_SHARE:
+        return model
+    return replace(model, mesh=vary_shape(model, rng))
 
 
 def _useful(item: TrainingView) -> bool:
