@@ -62,6 +62,14 @@ def training_scene(model: ObjectModel, seed: int) -> Scene:
     return simulate_heap(model, seed, count=count, bin=Bin(width, depth, height), name=name)
 
 
+def seen_model(scene: Scene, model: ObjectModel) -> ObjectModel:
+    """The object as it is in a scene for training: in half of the wild ones, of another shape."""
+    rng = np.random.default_rng([scene.seed, 5])
+    if scene.surroundings is None or rng.random() > _VARIED_SHARE:
+        return model
+    return replace(model, mesh=vary_shape(model, rng))
+
+
 def random_camera(rng: np.random.Generator, width: int = 640, height: int = 480) -> tuple[PinholeCamera, np.ndarray]:
     """Random intrinsics, and a (4, 4) ``T_world_camera`` that looks approximately at the bin from above the table.
 
@@ -114,7 +122,7 @@ def training_views(
         threads: number of threads for ray casting, 0 for one per core.
     """
     wild = scene.surroundings is not None
-    renderer = SceneRenderer(scene, model=_seen_model(scene, model), threads=threads)
+    renderer = SceneRenderer(scene, model=seen_model(scene, model), threads=threads)
     size = _SIZES[int(rng.integers(len(_SIZES)))] if wild else (640, 480)
     for index in range(count):
         if index % _VIEWS_PER_APPEARANCE == 0:
@@ -126,14 +134,6 @@ def training_views(
             if not wild or _useful(item):
                 break
         yield item
-
-
-def _seen_model(scene: Scene, model: ObjectModel) -> ObjectModel:
-    """The object as it is in the scene: by chance, another shape."""
-    rng = np.random.default_rng([scene.seed, 5])
-    if scene.surroundings is None or rng.random() > _VARIED_SHARE:
-        return model
-    return replace(model, mesh=vary_shape(model, rng))
 
 
 def _useful(item: TrainingView) -> bool:
