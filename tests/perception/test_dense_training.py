@@ -14,9 +14,8 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, transform_points
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, canonical_frame_of
-from active6d_perception.estimators.dense.decoding import DecodingParameters
 from active6d_perception.estimators.dense.dense_estimator import DenseEstimator, DenseParameters, log_odds
-from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize, split
+from active6d_perception.estimators.dense.network import HEADS, DenseNetwork, NetworkSize, split
 from active6d_perception.estimators.dense.network_input import output_camera, ray_frames, ray_rotation, reduction
 from active6d_perception.estimators.dense.sphere_bins import CENTRES
 from active6d_perception.estimators.dense.trained_network import (
@@ -49,7 +48,7 @@ PLACES = np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]) * 0.09 + [0,
 
 
 def view_of(name, seed=0, camera=DEFAULT_CAMERA, rotations=None):
-    """A sample of four well visible objects that lie nowhere near each other, and the renderer's coordinate map."""
+    """A sample of four well visible objects that lie nowhere near each other, and its view."""
     model, rng = load_object(name), np.random.default_rng(seed)
     rotations = Rotation.random(4, rng=rng).as_matrix() if rotations is None else rotations
     poses = make_transform(rotations, PLACES)
@@ -57,12 +56,10 @@ def view_of(name, seed=0, camera=DEFAULT_CAMERA, rotations=None):
     renderer = SceneRenderer(scene, model=model, threads=1)
     T_world_camera = look_at(EYE, np.zeros(3))
     seen = renderer.render(T_world_camera, camera)
-    truth = renderer.render(
-        T_world_camera, camera.scaled(0.5 / reduction(camera)), shaded=False, object_coordinates=True
-    )
+    truth = renderer.render(T_world_camera, camera.scaled(0.5 / reduction(camera)), shaded=False)
     view = View(0, seen.color, seen.depth, camera, T_world_camera)
     item = TrainingView(view, truth.depth, truth.instance, invert(T_world_camera) @ poses, np.ones(4))
-    return make_sample(item), truth.object_coordinates, view
+    return make_sample(item), view
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +73,7 @@ def right_answer(sample, targets):
     answer = np.zeros((sum(HEADS.values()), h, w), np.float32)
     parts = split(answer, axis=0)
     parts["mask"][0] = np.where(targets.mask > 0, 6, -6)
-    for name in ("centre", "coordinates", "axis"):
+    for name in ("centre", "axis"):
         parts[name].reshape(3, -1)[:, targets.pixel] = getattr(targets, name).T
     axis = targets.axis.T
     parts["axis_line"].reshape(6, -1)[:, targets.pixel] = [*axis**2, *(axis * np.roll(axis, -1, axis=0))]
@@ -86,20 +83,11 @@ def right_answer(sample, targets):
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_targets_agree_with_the_renderer(name):
-    sample, coordinates, _ = view_of(name)
+    sample, _ = view_of(name)
     model = load_object(name)
     canonical_frame = canonical_frame_of(model)
     targets = make_targets(sample, canonical_frame, model.diameter)
-    rendered = coordinates.reshape(-1, 3)[targets.pixel]
     instance = sample.instance.ravel()[targets.pixel]
-    # Back from canonical coordinates to the object's frame by the poses alone.
-    to_object = invert(sample.T_camera_object) @ canonical_frame.canonical_pose(sample.T_camera_object)
-    if canonical_frame.axis_rotation is AxisRotation.INVISIBLE:
-        about = [np.hypot(*rendered[:, :2].T), rendered[:, 2]]
-        said = targets.coordinates * model.diameter
-        assert np.allclose([np.hypot(*said[:, :2].T), said[:, 2]], about, atol=5e-4)
-    back = np.einsum("pij,pj->pi", to_object[instance][:, :3, :3], targets.coordinates * model.diameter)
-    assert np.allclose(back + to_object[instance][:, :3, 3], rendered, atol=5e-4)
     # Votes, axes and directions, each undone by hand.
     camera = output_camera(sample.view.camera)
     points = backproject(sample.surface_depth, camera).reshape(-1, 3)[targets.pixel]
@@ -124,15 +112,13 @@ def test_targets_agree_with_the_renderer(name):
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-@pytest.mark.parametrize("coordinates", [True, False])
-def test_a_right_answer_gives_right_poses(name, coordinates):
-    sample, _, _ = view_of(name)
+def test_a_right_answer_gives_right_poses(name):
+    sample, _ = view_of(name)
     model = load_object(name)
     canonical_frame = canonical_frame_of(model)
     answer = right_answer(sample, make_targets(sample, canonical_frame, model.diameter))
-    parameters = DenseParameters(decoding=DecodingParameters(coordinates=coordinates))
     trained = TrainedNetwork(DenseNetwork(SMALL), canonical_frame, name, model.diameter, SMALL)
-    estimator = DenseEstimator(model, trained, parameters)
+    estimator = DenseEstimator(model, trained)
     estimator.ask = lambda view: answer
     poses, label = estimator.locate(sample.view)
     assert len(poses.score) == 4
@@ -155,7 +141,7 @@ def test_a_hidden_handle_is_told():
     towards = np.stack([away[0], beside[1], away[2], beside[3]])  # where the handles point
     up = np.cross(away, beside)
     rotations = np.stack([towards, np.cross(up, towards), up], axis=-1) @ canonical_frame.T_object_axis[:3, :3].T
-    sample, _, _ = view_of("mug", rotations=rotations)
+    sample, _ = view_of("mug", rotations=rotations)
     for network_knows in (False, True):
         answer = right_answer(sample, make_targets(sample, canonical_frame, model.diameter))
         if not network_knows:
@@ -190,7 +176,7 @@ def test_a_hidden_handle_is_told():
 
 
 def test_shards_come_back(tmp_path, mug_view):
-    sample, _, _ = mug_view
+    sample, _ = mug_view
     write_shard(tmp_path / "a.npz", [sample, sample])
     back = read_shard(tmp_path / "a.npz")
     assert len(back) == 2
@@ -206,7 +192,7 @@ def test_shards_come_back(tmp_path, mug_view):
 
 
 def test_truth_of_another_size_is_refused(mug_view):
-    sample, _, view = mug_view
+    sample, view = mug_view
     with pytest.raises(ValueError, match="truth of a training view must be"):
         make_sample(replace(sample, view=view, surface_depth=np.ones((10, 10))))
 
@@ -227,7 +213,7 @@ def test_augmentation_keeps_the_truth_and_never_mirrors(mug_view):
 
 
 def test_a_crop_has_the_targets_of_the_whole(mug_view):
-    sample, _, _ = mug_view
+    sample, _ = mug_view
     model = load_object("mug")
     cropped = crop(sample, 96, 128, np.random.default_rng(3))
     assert cropped.view.depth.shape == (96, 128)
@@ -260,7 +246,7 @@ def test_random_cameras_look_at_the_bin_from_above():
 
 
 def test_loss_is_least_at_the_right_answer(mug_view):
-    sample, _, _ = mug_view
+    sample, _ = mug_view
     model = load_object("mug")
     targets = make_targets(sample, canonical_frame_of(model), model.diameter)
     right = torch.from_numpy(right_answer(sample, targets))[None]
@@ -277,7 +263,7 @@ def test_loss_is_least_at_the_right_answer(mug_view):
 
 def test_scale_is_learned_from_the_error(mug_view):
     """The likelihood is largest where the scale is the mean error over three."""
-    sample, _, _ = mug_view
+    sample, _ = mug_view
     model = load_object("mug")
     targets = make_targets(sample, canonical_frame_of(model), model.diameter)
     answer = torch.from_numpy(right_answer(sample, targets))[None]
@@ -295,7 +281,7 @@ def test_a_small_network_learns_a_view_by_heart(mug_view):
     """Every head's loss falls, and the axes and centres come out of a few hundred steps on one view."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    sample, _, view = view_of("coffee_cup", camera=DEFAULT_CAMERA.scaled(0.3))
+    sample, view = view_of("coffee_cup", camera=DEFAULT_CAMERA.scaled(0.3))
     model = load_object("coffee_cup")
     canonical_frame = canonical_frame_of(model)
     targets = make_targets(sample, canonical_frame, model.diameter)
@@ -398,30 +384,13 @@ def test_averaged_weights_follow_the_current_ones(mug_view, tmp_path):
     assert averaged.down0[0][1].num_batches_tracked == 3
 
 
-def test_a_network_without_coordinates_heads_is_trained_and_deployed(tmp_path, trained, mug_view):
-    folder, _ = trained
-    model, (sample, _, view) = load_object("mug"), mug_view
-    options = quick(loss=LossWeights(coordinates=0))
-    best = train(model, [folder / "views.npz"], [sample], tmp_path, options)
-    assert json.loads(best.with_suffix(".json").read_text())["heads"] == DEPLOYED_HEADS
-    network = load_network(best, model)
-    answer = DenseEstimator(model, network).ask(sample.view)
-    assert len(answer) == sum(HEADS.values()) - 4
-    assert create_estimator("dense", model, weights=str(best)).estimate(view).segmentation.shape == view.depth.shape
-    fitted = DenseParameters(decoding=DecodingParameters(coordinates=True))
-    with pytest.raises(ValueError, match="without the coordinates heads"):
-        DenseEstimator(model, network, fitted).locate(sample.view)
-
-
 def test_a_training_starts_from_trained_weights(tmp_path, trained):
-    """All weights are those of the file; heads that are no longer trained are left out."""
     start = load_network(trained[1], load_object("mug")).network
-    options = quick(start=str(trained[1]), loss=LossWeights(coordinates=0))
+    options = quick(start=str(trained[1]))
     network = _Run(load_object("mug"), tmp_path, options, "cpu").averaged_on_cpu()
-    assert network.heads == DEPLOYED_HEADS
     inputs = torch.rand(1, 16, 32, 48, generator=torch.Generator().manual_seed(0))
     ours, theirs = (split(item.eval()(inputs)) for item in (network, start))
-    for name in DEPLOYED_HEADS:
+    for name in HEADS:
         assert torch.allclose(ours[name], theirs[name], atol=1e-5)
     with pytest.raises(ValueError, match="cannot start from these weights"):
         _Run(load_object("mug"), tmp_path / "other", quick(start=str(trained[1]), size=NetworkSize()), "cpu")
@@ -447,31 +416,13 @@ def test_a_fitted_score_is_kept_beside_the_weights(tmp_path, trained):
         load_network(path, model)
 
 
-def test_the_coordinates_heads_do_not_change_what_is_deployed(mug_view):
-    sample, _, _ = mug_view
-    model = load_object("mug")
-    canonical_frame = canonical_frame_of(model)
-    answer = right_answer(sample, make_targets(sample, canonical_frame, model.diameter))
-    deployed = np.concatenate([part for name, part in split(answer, axis=0).items() if name in DEPLOYED_HEADS])
-    estimator = DenseEstimator(
-        model, TrainedNetwork(DenseNetwork(SMALL), canonical_frame, "mug", model.diameter, SMALL)
-    )
-    found = []
-    for output in (answer, deployed):
-        estimator.ask = lambda view, output=output: output
-        found.append(estimator.locate(sample.view)[0])
-    assert len(found[0].score) == 4
-    assert (found[0].T_camera_object == found[1].T_camera_object).all()
-    assert (found[0].score == found[1].score).all()
-
-
 def test_an_output_of_another_width_is_refused():
     with pytest.raises(ValueError, match="7 channels"):
         split(np.zeros((1, 7)))
 
 
 def test_validation_rates_a_perfect_network(mug_view, monkeypatch):
-    sample, _, _ = mug_view
+    sample, _ = mug_view
     model = load_object("mug")
     canonical_frame = canonical_frame_of(model)
     answer = right_answer(sample, make_targets(sample, canonical_frame, model.diameter))

@@ -6,6 +6,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 import trimesh
+
 from active6d_core.object_model import load_object
 from active6d_sim.datasets.training_views import seen_model
 from active6d_sim.scenes.scene import Bin, Scene

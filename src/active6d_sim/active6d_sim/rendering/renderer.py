@@ -13,7 +13,6 @@ import open3d as o3d
 
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, pixel_rays
 from active6d_core.object_model import ObjectModel, load_object
-from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.rendering.appearance import Appearance
 from active6d_sim.rendering.shading import Shader, SurfacePoints
@@ -40,8 +39,6 @@ class RenderedView:
         instance: (H, W) int16 index into ``Scene.T_world_all`` (ground truth's objects first), -1 elsewhere.
         normals: (H, W, 3) float32 unit surface normals in the camera frame, smooth over curved surfaces, facing the
             camera; zero without surface.
-        object_coordinates: (H, W, 3) float32 surface points in the frame of the pixel's object, metres, zero elsewhere;
-            None where they were not asked for.
         albedo: (H, W) float32 diffuse reflectance in [0, 1], 0 without surface; None without colour.
         gloss: (H, W) float32 strength of mirror-like reflection in [0, 1], 0 without surface; None without colour.
     """
@@ -50,7 +47,6 @@ class RenderedView:
     depth: np.ndarray
     instance: np.ndarray
     normals: np.ndarray
-    object_coordinates: np.ndarray | None = None
     albedo: np.ndarray | None = None
     gloss: np.ndarray | None = None
 
@@ -88,7 +84,6 @@ class SceneRenderer:
         self.scene = scene
         self.model = model or load_object(scene.object_name)
         self._threads = threads
-        self._T_object_world = invert(scene.T_world_all).astype(np.float32)
         self._soup = soup = build_soup(self.model.mesh, scene)
         self._caster = o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._caster.add_triangles(soup.vertices, soup.faces)
@@ -114,7 +109,6 @@ class SceneRenderer:
         camera: PinholeCamera = DEFAULT_CAMERA,
         *,
         shaded: bool = True,
-        object_coordinates: bool = False,
     ) -> RenderedView:
         """One noise-free view.
 
@@ -122,7 +116,6 @@ class SceneRenderer:
             T_world_camera: (4, 4) pose of the optical frame.
             camera: intrinsics of all images.
             shaded: whether to render the colour image, which takes most of the time.
-            object_coordinates: whether to render the image of that name.
         """
         R = np.asarray(T_world_camera[:3, :3], np.float32)
         eye = np.asarray(T_world_camera[:3, 3], np.float32)
@@ -143,19 +136,11 @@ class SceneRenderer:
             shading = self._shader.shade(SurfacePoints(points, normals, openness, material, directions))
             color = shading.color.reshape(*shape, 3)
             albedo, gloss = np.where(hit, shading.albedo, 0).reshape(shape), shading.gloss.reshape(shape)
-        coordinates = None
-        if object_coordinates:
-            on_object = solid[material[solid] < self._first_thing]
-            T = self._T_object_world[material[on_object] - FIRST_OBJECT]
-            coordinates = np.zeros_like(points)
-            coordinates[on_object] = np.einsum("pij,pj->pi", T[:, :3, :3], points[on_object]) + T[:, :3, 3]
-            coordinates = coordinates.reshape(*shape, 3)
         return RenderedView(
             color,
             np.where(hit, depth, np.float32(np.nan)).reshape(shape),
             self._instance(material).astype(np.int16).reshape(shape),
             (normals @ R).reshape(*shape, 3),
-            coordinates,
             albedo,
             gloss,
         )

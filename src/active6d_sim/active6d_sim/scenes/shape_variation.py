@@ -51,11 +51,9 @@ def vary_shape(
     axis = model.symmetry.axis
     symmetric = axis is not None
     main = np.array(axis if axis is not None else _direction(rng), float)
-    mesh = trimesh.Trimesh(
-        *trimesh.remesh.subdivide_to_size(
-            model.mesh.vertices, model.mesh.faces, model.diameter / _EDGES_PER_DIAMETER, max_iter=20
-        )
-    )
+    edge = model.diameter / _EDGES_PER_DIAMETER
+    fine = trimesh.remesh.subdivide_to_size(model.mesh.vertices, model.mesh.faces, edge)  # type: ignore[no-untyped-call]
+    mesh = trimesh.Trimesh(*fine)
     vertices = np.asarray(mesh.vertices)
     height = vertices @ main
     moved = np.zeros(len(vertices))

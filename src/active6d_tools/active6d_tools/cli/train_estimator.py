@@ -55,7 +55,6 @@ def estimator(
     from active6d_core.files import cache_folder
     from active6d_core.object_model import load_object
     from active6d_perception.estimators.dense.training.loop import TrainingOptions
-    from active6d_perception.estimators.dense.training.losses import LossWeights
     from active6d_tools.training_data import render_missing
 
     model = load_object(object_name)
@@ -70,9 +69,7 @@ def estimator(
         shards = render_missing(object_name, folder, heaps, views, cores, on_progress)
     if render_only:
         return
-    options = TrainingOptions(
-        steps=steps, batch=batch, learning_rate=rate, seed=seed, start=str(start or ""), loss=LossWeights(coordinates=0)
-    )
+    options = TrainingOptions(steps=steps, batch=batch, learning_rate=rate, seed=seed, start=str(start or ""))
     best, history = _train(model, shards, folder / run, options, cores)
     score = _fit_score(model, best, seed)
     if export is not None:

@@ -62,11 +62,6 @@ class CanonicalFrame:
         chosen = (eye @ _REFERENCE).argmax(axis=1)
         return equals[np.arange(len(chosen)), chosen] @ self.T_object_axis
 
-    def canonical_pose(self, T_camera_object: np.ndarray) -> np.ndarray:
-        """(n, 4, 4) ``T_camera_canonical`` of (n, 4, 4) object poses."""
-        T_camera_axis = self.axis_pose(T_camera_object)
-        return T_camera_axis if self.axis_rotation is AxisRotation.VISIBLE else facing_camera(T_camera_axis)
-
     def object_pose(self, T_camera_axis: np.ndarray) -> np.ndarray:
         """(n, 4, 4) ``T_camera_object`` of (n, 4, 4) poses of the axis frame."""
         return T_camera_axis @ invert(self.T_object_axis)

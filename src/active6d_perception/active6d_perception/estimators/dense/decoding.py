@@ -16,7 +16,6 @@ from active6d_perception.estimators.dense.canonical_frame import (
 )
 from active6d_perception.estimators.dense.network import split
 from active6d_perception.estimators.dense.network_input import ray_frames, ray_rotation
-from active6d_perception.estimators.dense.rigid_fit import robust_fit
 from active6d_perception.estimators.dense.sphere_bins import density
 from active6d_perception.estimators.dense.votes import cluster_votes
 
@@ -27,17 +26,13 @@ class DecodingParameters:
 
     Attributes:
         mask_threshold: probability above which a pixel belongs to an object.
-        pixels: largest number of pixels per instance that the fit uses.
+        pixels: largest number of pixels per instance whose votes are averaged.
         fewest_pixels: an instance with fewer pixels is dropped.
-        tolerance: residual at which a correspondence has half the weight.
-        coordinates: whether to fit object coordinates to points; otherwise poses come from votes for centre and axis.
     """
 
     mask_threshold: float = 0.3
     pixels: int = 160
     fewest_pixels: int = 12
-    tolerance: float = 0.05
-    coordinates: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,22 +73,17 @@ def decode(
         canonical_frame: the frame that the network was trained with.
         diameter: the object's, metres.
         parameters: thresholds.
-
-    Raises:
-        ValueError: ``parameters`` ask for a fit of coordinates that the network does not predict.
     """
     probability = expit(answer[0])
     pixel = np.flatnonzero((probability > parameters.mask_threshold) & np.isfinite(depth))
     # The network's memory is channels last, so that this makes no copy and each pixel's channels are contiguous.
     parts = split(np.moveaxis(answer, 0, -1).reshape(-1, len(answer))[pixel])
-    if parameters.coordinates and "coordinates" not in parts:
-        raise ValueError("this network was trained without the coordinates heads")
     points = pixel_rays(camera).reshape(-1, 3)[pixel] * depth.ravel()[pixel, None]
     votes = points + diameter * np.einsum("pij,pj->pi", ray_frames(camera).reshape(-1, 3, 3)[pixel], parts["centre"])
     weight = np.exp(-np.clip(parts["centre_scale"][:, 0], -4.0, 0.0))
     clusters = cluster_votes(votes, weight, diameter, parameters.fewest_pixels)
     member = clusters.label >= 0
-    label, pixel, points = clusters.label[member], pixel[member], points[member]
+    label, pixel = clusters.label[member], pixel[member]
     parts = {name: part[member] for name, part in parts.items()}
     count = len(clusters.centre)
     table, used = member_table(label, count, parameters.pixels)
@@ -101,20 +91,9 @@ def decode(
     direction = softmax(_mean(log_softmax(parts["direction"], axis=1), label, count), axis=1)
     T = _poses_from_axes(parts, table, used, votes[member], R_camera_ray)
     if canonical_frame.axis_rotation is AxisRotation.VISIBLE:
-        # The fit of coordinates starts from this rotation; the orientation search uses centre and axis only.
         T = T @ rotation_about_z(AXIS_ANGLES[axis_rotation_probability(T, direction).argmax(axis=1)])
     else:
         T = facing_camera(T)
-    if count and parameters.coordinates:
-        trust = used * np.exp(-np.clip(parts["coordinates_scale"][:, 0], -4.0, 0.0))[table]
-        T, _ = robust_fit(
-            parts["coordinates"][table].astype(float) * diameter,
-            points[table].astype(float),
-            trust.astype(float),
-            parameters.tolerance * diameter,
-            np.random.default_rng(0),
-            T[:, None],
-        )
     return Instances(pixel, label, T, direction)
 
 

@@ -1,6 +1,5 @@
 """The network of the dense estimator: a small U-Net whose output has half the resolution of its input."""
 
-from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -18,15 +17,11 @@ HEADS = {
     "mask": 1,  # logit: an object or not
     "centre": 3,  # from the surface point to the axis frame's origin, in the frame of the pixel's ray, diameters
     "centre_scale": 1,  # logarithm of the Laplace scale of its error
-    "coordinates": 3,  # the surface point in the canonical frame, diameters
-    "coordinates_scale": 1,  # logarithm of the Laplace scale of its error
     "axis": 3,  # the axis frame's z in the frame of the ray through its origin; not normalised
     "axis_line": 6,  # products xx, yy, zz, xy, yz, zx of the axis: the axis without its sign, which is learned sooner
     "direction": DIRECTION_BINS,  # logits: the axis frame's x, in the frame of the ray through its origin
 }
-#: The heads that deployment decodes; the others only serve the comparison in ``docs/estimator.md``.
-DEPLOYED_HEADS = {name: channels for name, channels in HEADS.items() if not name.startswith("coordinates")}
-
+_CHANNELS_OUT = sum(HEADS.values())
 _WIDEST = 1024
 
 
@@ -45,27 +40,17 @@ class NetworkSize:
 
 
 class DenseNetwork(nn.Module):
-    """(n, CHANNELS, h, w) input, both sides multiples of 16, to (n, channels of all heads, h / 2, w / 2).
+    """(n, CHANNELS, h, w) input, both sides multiples of 16, to (n, channels of all :data:`HEADS`, h / 2, w / 2)."""
 
-    Attributes:
-        heads: name and number of channels of each part of the output, in their order.
-    """
-
-    def __init__(self, size: NetworkSize = NetworkSize(), heads: Mapping[str, int] = HEADS) -> None:
-        """
-        Args:
-            size: channels of the layers.
-            heads: :data:`HEADS` or :data:`DEPLOYED_HEADS`.
-        """
+    def __init__(self, size: NetworkSize = NetworkSize()) -> None:
         super().__init__()
-        self.heads = dict(heads)
         fine, middle, coarse, coarsest = size.widths
         self.down0 = nn.Sequential(_convolution(CHANNELS, fine, stride=2), _convolution(fine, fine))
         self.down1 = nn.Sequential(_convolution(fine, middle, stride=2), Residual(middle))
         self.down2 = nn.Sequential(_convolution(middle, coarse, stride=2), Residual(coarse))
         self.down3 = nn.Sequential(_convolution(coarse, coarsest, stride=2), Residual(coarsest), Residual(coarsest))
         self.up2, self.up1, self.up0 = Merge(coarsest, coarse), Merge(coarse, middle), Merge(middle, fine)
-        self.answer = nn.Sequential(_convolution(fine, size.last), nn.Conv2d(size.last, sum(heads.values()), 1))
+        self.answer = nn.Sequential(_convolution(fine, size.last), nn.Conv2d(size.last, _CHANNELS_OUT, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         x0 = self.down0(x)
@@ -129,13 +114,12 @@ def split(answer: Any, axis: int = 1) -> dict[str, Any]:
     """The network's output by head: views of a torch tensor or NumPy array, cut along ``axis``.
 
     Raises:
-        ValueError: the number of channels is neither that of :data:`HEADS` nor that of :data:`DEPLOYED_HEADS`.
+        ValueError: the number of channels is not that of :data:`HEADS`.
     """
-    heads = {sum(heads.values()): heads for heads in (HEADS, DEPLOYED_HEADS)}.get(answer.shape[axis])
-    if heads is None:
-        raise ValueError(f"the output of the network has {answer.shape[axis]} channels, which fits no list of heads")
+    if answer.shape[axis] != _CHANNELS_OUT:
+        raise ValueError(f"the output of the network has {answer.shape[axis]} channels; its heads have {_CHANNELS_OUT}")
     parts, start = {}, 0
-    for name, channels in heads.items():
+    for name, channels in HEADS.items():
         parts[name] = answer[(slice(None),) * axis + (slice(start, start + channels),)]
         start += channels
     return parts

@@ -13,7 +13,7 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import is_rigid
 from active6d_core.structured_text import read_json
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
-from active6d_perception.estimators.dense.network import DEPLOYED_HEADS, HEADS, DenseNetwork, NetworkSize
+from active6d_perception.estimators.dense.network import HEADS, DenseNetwork, NetworkSize
 from active6d_perception.estimators.dense.network_input import CHANNELS
 from active6d_perception.estimators.pose_selection import FEATURES
 from active6d_perception.estimators.score_model import ScoreModel
@@ -102,7 +102,6 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
         )
         if not is_rigid(canonical_frame.T_object_axis, 1e-5):
             raise ValueError("T_object_axis is not a rigid transform")
-        heads = HEADS if description["heads"] == HEADS else DEPLOYED_HEADS
         fitted = {"score": SCORE_FEATURES, "certainty": CERTAINTY_FEATURES}
         score, certainty = (
             ScoreModel.from_dict(description[name], features) if name in description else None
@@ -112,7 +111,7 @@ def load_network(path: Path, model: ObjectModel) -> TrainedNetwork:
     except Exception as error:
         raise ValueError(f"{path.with_suffix('.json')}: bad description of a network ({error})") from error
     try:
-        network = load_module(path, lambda: DenseNetwork(size, heads))
+        network = load_module(path, lambda: DenseNetwork(size))
     except (OSError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(
@@ -138,7 +137,7 @@ def _read_description(path: Path, model: ObjectModel) -> dict[str, Any]:
             f"not for {model.name} ({1000 * model.diameter:.1f} mm); {_advice(model)}"
         )
     version = description.get("format"), description.get("input_channels")
-    if version != (_FORMAT, CHANNELS) or description.get("heads") not in (HEADS, DEPLOYED_HEADS):
+    if version != (_FORMAT, CHANNELS) or description.get("heads") != HEADS:
         raise ValueError(f"{described}: made by another version of the network; {_advice(model)}")
     return description
 

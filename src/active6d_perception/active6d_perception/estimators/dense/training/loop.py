@@ -21,12 +21,9 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import canonical_frame_of
 from active6d_perception.estimators.dense.network import (
-    DEPLOYED_HEADS,
-    HEADS,
     DenseNetwork,
     NetworkSize,
     has_fast_bfloat16,
-    split,
 )
 from active6d_perception.estimators.dense.trained_network import TrainedNetwork, load_network, save_network
 from active6d_perception.estimators.dense.training.batches import TrainingViews, batches
@@ -169,7 +166,7 @@ class _Run:
     def __init__(self, model: ObjectModel, folder: Path, options: TrainingOptions, device: str) -> None:
         torch.manual_seed(options.seed)
         self._options, self._device = options, torch.device(device)
-        network: Any = DenseNetwork(options.size, HEADS if options.loss.coordinates else DEPLOYED_HEADS)
+        network: Any = DenseNetwork(options.size)
         if options.start:
             _start_from(network, load_network(Path(options.start), model).network)
         self._network: DenseNetwork = network.to(self._device, memory_format=torch.channels_last).train()
@@ -242,20 +239,13 @@ class _Run:
 
 
 def _start_from(network: DenseNetwork, trained: DenseNetwork) -> None:
-    """Copy weights; heads that only one of the networks has are left out.
+    """Copy weights.
 
     Raises:
         ValueError: the networks have layers of other sizes.
     """
-    weights = trained.state_dict()
-    own = network.state_dict()
-    rows = split(torch.arange(sum(trained.heads.values()))[None])
-    kept = torch.cat([rows[name][0] for name in network.heads if name in rows])
-    if network.heads.keys() <= trained.heads.keys():
-        for name in ("answer.1.weight", "answer.1.bias"):
-            weights[name] = weights[name][kept]
     try:
-        network.load_state_dict(own | weights)
+        network.load_state_dict(trained.state_dict())
     except RuntimeError as error:
         raise ValueError(f"cannot start from these weights: {str(error).splitlines()[-1].strip()}") from error
 

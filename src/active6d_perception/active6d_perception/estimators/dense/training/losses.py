@@ -16,14 +16,10 @@ SCALE_RANGE = (-5.8, 0.4)
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weight of each term of the loss; 0 leaves a head untrained.
-
-    With ``coordinates`` 0 the network has no coordinates heads, which deployment does not use.
-    """
+    """Weight of each term of the loss; 0 leaves a head untrained."""
 
     mask: float = 1.0
     centre: float = 2.0
-    coordinates: float = 2.0
     scale: float = 0.1
     axis: float = 2.0
     axis_line: float = 2.0
@@ -33,12 +29,12 @@ class LossWeights:
 def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
     """Compute the terms of the loss, by the names of :class:`LossWeights`.
 
-    ``centre``, ``coordinates`` and ``axis`` are mean distances ``e``, the first two in diameters. ``scale`` is the
-    negative log-likelihood ``e / b + 3 log b`` of an isotropic Laplace distribution in space. The network predicts its
-    scale b, and so learns where its errors are large.
+    ``centre`` and ``axis`` are mean distances ``e``, the first in diameters. ``scale`` is the negative log-likelihood
+    ``e / b + 3 log b`` of an isotropic Laplace distribution in space. The network predicts its scale b, and so learns
+    where the error of the centre is large.
 
-    The likelihood trains b only: ``e`` is held fixed in it. Otherwise each head would be weighted by 1 / b, and heads
-    that are learned early (the centre) would outweigh difficult ones (the axis).
+    The likelihood trains b only: ``e`` is held fixed in it. Otherwise the head would be weighted by 1 / b, and the
+    centre, which is learned early, would outweigh the axis, which is difficult.
 
     Args:
         answer: (n, channels, h, w) output of the network, at least as large as the targets.
@@ -50,15 +46,12 @@ def loss_terms(answer: Tensor, targets: Sequence[Targets]) -> dict[str, Tensor]:
     terms = {"mask": F.binary_cross_entropy_with_logits(answer[:, 0], mask)}
     pixel = torch.cat([torch.from_numpy(target.pixel + i * height * width) for i, target in enumerate(targets)])
     parts = split(answer.movedim(1, -1).reshape(-1, answer.shape[1])[pixel.to(answer.device)], axis=1)
-    points = [name for name in ("centre", "coordinates") if name in parts]
-    wanted = {name: _gather(targets, name, answer) for name in ("weight", *points, "axis", "direction")}
+    wanted = {name: _gather(targets, name, answer) for name in ("weight", "centre", "axis", "direction")}
     weight = wanted["weight"] / wanted["weight"].sum().clamp(min=1.0)
-    terms["scale"] = answer.new_zeros(())
-    for name in points:
-        log_scale = parts[f"{name}_scale"][:, 0].clamp(*SCALE_RANGE)
-        error = (parts[name] - wanted[name]).norm(dim=1)
-        terms[name] = (weight * error).sum()
-        terms["scale"] = terms["scale"] + (weight * (error.detach() * torch.exp(-log_scale) + 3 * log_scale)).sum()
+    log_scale = parts["centre_scale"][:, 0].clamp(*SCALE_RANGE)
+    error = (parts["centre"] - wanted["centre"]).norm(dim=1)
+    terms["scale"] = (weight * (error.detach() * torch.exp(-log_scale) + 3 * log_scale)).sum()
+    terms["centre"] = (weight * error).sum()
     terms["axis"] = (weight * (parts["axis"] - wanted["axis"]).norm(dim=1)).sum()
     terms["axis_line"] = (weight * (parts["axis_line"] - _line(wanted["axis"])).norm(dim=1)).sum()
     cross_entropy = -(wanted["direction"] * F.log_softmax(parts["direction"], dim=1)).sum(dim=1)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from active6d_core.camera import pixel_rays
-from active6d_core.se3 import invert
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import AxisRotation, CanonicalFrame
 from active6d_perception.estimators.dense.network import DIRECTION_BINS
@@ -23,7 +22,6 @@ class Targets:
         weight: (p,) float32, mean 1. The weight of an instance grows with the root of its number of pixels, so that
             distant ones matter, and with its visible fraction, because a sliver does not show the orientation.
         centre: (p, 3) float32, see the network's head of this name.
-        coordinates: (p, 3) float32, see the head of this name.
         axis: (p, 3) float32, see the head of this name.
         direction: (p, DIRECTION_BINS) float32 distribution over the bins; zero where nothing shows the rotation.
     """
@@ -32,7 +30,6 @@ class Targets:
     pixel: np.ndarray
     weight: np.ndarray
     centre: np.ndarray
-    coordinates: np.ndarray
     axis: np.ndarray
     direction: np.ndarray
 
@@ -49,11 +46,9 @@ def make_targets(sample: TrainingView, canonical_frame: CanonicalFrame, diameter
     pixel = np.flatnonzero((sample.instance >= 0) & np.isfinite(sample.surface_depth))
     instance = sample.instance.ravel()[pixel]
     points = pixel_rays(camera).reshape(-1, 3)[pixel] * sample.surface_depth.ravel()[pixel, None]
-    T_canonical = canonical_frame.canonical_pose(sample.T_camera_object)
     T_axis = canonical_frame.axis_pose(sample.T_camera_object)
     R_camera_ray = ray_frames(camera).reshape(-1, 3, 3)[pixel]
     R_ray_camera = np.swapaxes(ray_rotation(T_axis[:, :3, 3]), 1, 2)
-    to_canonical = invert(T_canonical)[instance]
     direction = np.zeros((len(T_axis), DIRECTION_BINS), np.float32)
     if canonical_frame.axis_rotation is not AxisRotation.INVISIBLE:
         direction = kernel(np.einsum("nij,nj->ni", R_ray_camera, T_axis[:, :3, 0]))
@@ -64,9 +59,6 @@ def make_targets(sample: TrainingView, canonical_frame: CanonicalFrame, diameter
         pixel=pixel,
         weight=(weight / weight.mean() if len(weight) else weight).astype(np.float32),
         centre=(np.einsum("pij,pi->pj", R_camera_ray, T_axis[instance, :3, 3] - points) / diameter).astype(np.float32),
-        coordinates=(
-            (np.einsum("pij,pj->pi", to_canonical[:, :3, :3], points) + to_canonical[:, :3, 3]) / diameter
-        ).astype(np.float32),
         axis=np.einsum("nij,nj->ni", R_ray_camera, T_axis[:, :3, 2]).astype(np.float32)[instance],
         direction=direction[instance],
     )
