@@ -198,7 +198,8 @@ def test_clusters_of_votes_are_the_objects(seed):
     assert len(clusters.centre) == len(centres)
     distance = np.linalg.norm(clusters.centre[:, None] - centres, axis=-1)
     matched = distance.argmin(axis=0)
-    assert distance.min(axis=0).max() < 0.003
+    # The mean of n votes is off by 4 mm over the root of n in each direction; six times that is beyond chance.
+    assert (distance.min(axis=0) < 6 * 0.004 / np.sqrt(np.bincount(owner))).all()
     assert (clusters.label[: len(owner)] == matched[owner]).mean() > 0.99
 
 

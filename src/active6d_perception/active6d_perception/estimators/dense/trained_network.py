@@ -69,7 +69,7 @@ def save_network(path: Path, trained: TrainedNetwork) -> None:
         "object": trained.object_name,
         "diameter": trained.diameter,
         "input_channels": CHANNELS,
-        "heads": trained.network.heads,
+        "heads": HEADS,
         "size": asdict(trained.size),
         "turn": trained.canonical_frame.axis_rotation.value,
         "T_object_axis": trained.canonical_frame.T_object_axis.tolist(),
