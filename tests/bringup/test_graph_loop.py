@@ -28,7 +28,7 @@ from active6d_core.ros.topics import CONTRACT, Per
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator
-from active6d_perception.scene.fusion import SceneFusion
+from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.observed_surface import ObservedSurface
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.active_stereo import ActiveStereo
@@ -133,7 +133,7 @@ def test_images_are_the_simulators(record, scene, settings):
 
 def test_perception_and_policy_are_the_core_functions(record):
     model = load_object("mug")
-    estimator, verifier, fusion = create_estimator("geometric", model), Verifier(model), SceneFusion(model)
+    estimator, verifier, fusion = create_estimator("geometric", model), Verifier(model), JointFusion(model)
     surface = ObservedSurface(model)
     policy = create_policy("auto", model)
     policy.reset(np.random.default_rng([3, record.steps[0].stamp]))
@@ -145,9 +145,8 @@ def test_perception_and_policy_are_the_core_functions(record):
             hypotheses_to_cloud(found, view.stamp, "c"), found.segmentation, "c"
         )  # messages hold float32
         assert_same(step.hypotheses, hypotheses)
-        fusion.add_view(
-            view.stamp, view.T_world_camera, hypotheses, verifier.score(view.depth, view.camera, hypotheses)
-        )
+        verification = verifier.score(view.depth, view.camera, hypotheses)
+        fusion.add_view(view.stamp, view.T_world_camera, hypotheses, verification, view.depth, view.camera)
         fused = fusion.objects(view.stamp, view.T_world_camera, view.camera)
         objects = objects_from_cloud(objects_to_cloud(fused, view.stamp, "w"), "w")
         assert_same(step.objects, objects)

@@ -9,11 +9,21 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model import model_views
+from active6d_perception.scene import (
+    body_refinement,
+    feasibility,
+    fusion,
+    joint_fusion,
+    measured_cases,
+    measured_view,
+    pose_lattice,
+    verification,
+)
 from active6d_perception.scene import expected_visibility as visibility
-from active6d_perception.scene import fusion, verification
 from active6d_perception.scene import observed_surface as surface
 
-MODULES = (fusion, model_views, surface, verification, visibility)
+JOINT = (body_refinement, feasibility, measured_cases, measured_view, pose_lattice)
+MODULES = (fusion, model_views, surface, verification, visibility, *JOINT)
 
 
 def versions():
@@ -30,7 +40,8 @@ def test_no_view_waits_for_the_compiler(render, pose):
     """Neither the first one nor one with read-only images."""
     model = load_object("mug")
     verifier, scene = verification.Verifier(model), surface.ObservedSurface(model)
-    visible, fused = visibility.ExpectedVisibility(model), fusion.SceneFusion(model)
+    visible = visibility.ExpectedVisibility(model)
+    fused, joint = fusion.SceneFusion(model), joint_fusion.JointFusion(model)
     compiled = versions()
     assert sum(compiled.values()) >= 8
     depth = render(model, pose(0))[0].copy()
@@ -44,6 +55,8 @@ def test_no_view_waits_for_the_compiler(render, pose):
         scene.add_view(1, depth, DEFAULT_CAMERA, T_world_camera)
         fused.add_view(int(writable), T_world_camera, hypotheses, np.ones(1))
         assert len(fused.objects(int(writable), T_world_camera, DEFAULT_CAMERA)) == 1
+        joint.add_view(int(writable), T_world_camera, hypotheses, np.ones(1), depth, DEFAULT_CAMERA)
+        assert len(joint.objects(int(writable), T_world_camera, DEFAULT_CAMERA)) == 1
         T_world_object = T_world_camera @ pose(0)
         scene.unexplained(T_world_object)
         for tray in (None, visibility.Tray.for_model(model)):

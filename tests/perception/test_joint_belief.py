@@ -302,6 +302,22 @@ def test_the_belief_learns_what_tells_right_poses():
     np.testing.assert_array_equal(again[0][0].hidden, again[1][0].hidden)
 
 
+def test_objects_with_and_without_rotations_are_learned_together():
+    rng = np.random.default_rng(0)
+    mixed = places(rng, 300)
+    alone = replace(mixed, rotations=mixed.rotations[:, :1], right=mixed.right[:, :1])
+    kept = np.isin(alone.place, alone.place[alone.right[:, 0]])
+    number = np.unique(alone.place[kept], return_inverse=True)[1]
+    alone = replace(
+        alone, rotations=alone.rotations[kept], bodies=alone.bodies[kept], place=number, right=alone.right[kept]
+    )
+    rotation, body = fit_belief([mixed, alone])
+    unseen = places(rng, 200)
+    probability = posterior(rotation(unseen.rotations) + body(unseen.bodies)[:, None], unseen.place)
+    chosen = probability.reshape(200, 6).argmax(axis=1)
+    assert unseen.right.reshape(200, 6)[np.arange(200), chosen].mean() > 0.75
+
+
 def test_without_a_right_pose_nothing_can_be_learned():
     rng = np.random.default_rng(0)
     nothing = replace(places(rng, 1), place=np.zeros(0, int), right=np.zeros((0, 3), bool))

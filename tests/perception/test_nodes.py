@@ -240,7 +240,9 @@ def test_an_object_set_on_an_unconfigured_node_is_the_one_that_is_loaded(graph):
                 node.start()
 
 
-def test_fusion_publishes_verified_objects(graph, fusion, seen, tmp_path):
+def test_fusion_by_the_best_view_publishes_verified_objects(graph, seen, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    graph.add(HypothesisFusionNode(context=graph.context, overrides={"method": "best-view"}))
     objects, poses = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(PoseArray, "objects/poses", True)
     markers = graph.mailbox(MarkerArray, "objects/markers", True)
     send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
@@ -265,7 +267,7 @@ def test_fusion_from_all_views_is_that_of_the_core(graph, seen, tmp_path, monkey
     monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path))
     weights = replace(BeliefWeights.indifferent(), probability=Scorer.of_weights(np.full(len(OBJECT_COLUMNS), 0.1)))
     weights.save(tmp_path / belief_file("mug"), "mug")
-    overrides = {"method": "all-views", "bin_width": 0.5, "wall_height": 0.0, "confirmed": 0.99}
+    overrides = {"bin_width": 0.5, "wall_height": 0.0, "confirmed": 0.99}
     graph.add(HypothesisFusionNode(context=graph.context, overrides=overrides))
     objects, markers = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(MarkerArray, "objects/markers", True)
     send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
@@ -288,7 +290,7 @@ def test_weights_that_do_not_fit_are_named(graph, tmp_path, monkeypatch):
     monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path))
     (tmp_path / belief_file("mug")).write_bytes(b"")
     with pytest.raises(ValueError, match=r"no weights of fusion .*active6d train fusion"):
-        graph.add(HypothesisFusionNode(context=graph.context, overrides={"method": "all-views"}))
+        graph.add(HypothesisFusionNode(context=graph.context))
 
 
 def box_on_the_floor(stamp, left=60):

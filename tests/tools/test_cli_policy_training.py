@@ -126,13 +126,14 @@ def test_the_pipelines_rates_are_its_times(prepared, tmp_path, monkeypatch):
 
 def test_every_repeat_sees_the_same_views(prepared, tmp_path):
     """The command, end to end, on prepared views; fusion makes of them what it makes of them once."""
-    from active6d_perception.scene.fusion import SceneFusion
+    from active6d_perception.scene.joint_fusion import JointFusion
     from active6d_perception.scene.verification import Verifier
 
-    verifier, fusion = Verifier(prepared.model), SceneFusion(prepared.model)
+    verifier, fusion = Verifier(prepared.model), JointFusion(prepared.model)
     for view in prepared.views:
         found = prepared.hypotheses[view.stamp]
-        fusion.add_view(view.stamp, view.T_world_camera, found, verifier.score(view.depth, view.camera, found))
+        verification = verifier.score(view.depth, view.camera, found)
+        fusion.add_view(view.stamp, view.T_world_camera, found, verification, view.depth, view.camera)
     expected = len(fusion.objects(view.stamp, view.T_world_camera, view.camera))
     file, png = tmp_path / "pipeline.json", tmp_path / "pipeline.png"
     result = run("benchmark", "pipeline", "--repeats", "2", "--json", str(file), "--png", str(png))

@@ -118,7 +118,8 @@ class SceneObjects:
         box: (n, 4) normalised box in the current camera (paper: b), re-projected for objects not seen in this view.
         depth: (n,) metres along z in the current camera (paper: d).
         support: (n,) int, number of views with a hypothesis in the object's cluster.
-        spread: (n,) largest distance between the cluster's hypotheses, metres (0 with one hypothesis).
+        spread: (n,) how far its hypotheses disagree, metres: the largest distance of two, or of one from an
+            object that is fused from all views.
         probability: (n,) in [0, 1], that the ADD of the pose is below 10 % of the diameter.
         entropy: (n,) of the belief over the poses that are possible at the object's place, nats; 0 if only one was
             considered.

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.scene_lookup import SceneLookup
 
 #: Weights of the checkpoint with the best validation result, in the folder of a training.
 BEST = "best.safetensors"
@@ -24,7 +24,7 @@ class PolicyTraining:
 
     folder: Path
     total: int
-    start: Callable[[BatchedFusion, BatchedFusion], Iterator[Any]]
+    start: Callable[[SceneLookup, SceneLookup], Iterator[Any]]
 
     @property
     def best(self) -> Path:

@@ -6,7 +6,8 @@ one compressed ``.npz`` per object and split, without pickled data. It holds:
 - hypotheses as tables, in the camera's frame and in float32 as in the graph's messages;
 - the true poses, and the ADD of every hypothesis against every object within 50 mm;
 - each view's entropy;
-- the surface that each view's depth image shows, one bit for each cell of a grid over the bin.
+- the surface that each view's depth image shows, one bit for each cell of a grid over the bin;
+- what each view says of the candidates of the scene, for the fusion of all views (:mod:`.evidence_tables`).
 """
 
 import json
@@ -29,10 +30,15 @@ from active6d_core.se3 import quaternion_from_transform, transform_from_quaterni
 from active6d_core.structured_text import parse_json
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import Estimator
+from active6d_perception.scene.belief_weights import BeliefWeights
+from active6d_perception.scene.evidence_tables import EvidenceTables, tabulate
+from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.observed_surface import SurfaceGrid
 from active6d_perception.scene.verification import Verifier
 
-FORMAT = 2
+FORMAT = 3
+#: Banks of this format have no evidence; their look-up fuses by the best view.
+_WITHOUT_EVIDENCE = 2
 SHIPPED_BANKS = Path(__file__).parent / "shipped"
 _MOST_PAIRS = 50_000_000
 _HYPOTHESIS_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw", "verification", "score", "x0", "y0", "x1", "y1", "depth")
@@ -51,6 +57,7 @@ class BankScene:
         errors: (H, n) float32 ADD in metres, ``inf`` from 50 mm on.
         entropy: (M,) entropy of each view's masks, nats.
         surface: (M, ceil(cells / 8)) uint8, packed bits: the cells of the bank's grid that each view shows surface in.
+        evidence: of all views on the scene's candidates; None if only the best view of each object is to be fused.
 
     Raises:
         ValueError: shapes disagree, or a number is not finite.
@@ -63,6 +70,7 @@ class BankScene:
     errors: np.ndarray
     entropy: np.ndarray
     surface: np.ndarray
+    evidence: EvidenceTables | None = None
 
     def __post_init__(self) -> None:
         H, n = len(self.view), len(self.T_world_object)
@@ -76,6 +84,8 @@ class BankScene:
             raise ValueError(f"{self.name}: a number is not finite")
         if np.isnan(self.errors).any() or n == 0:
             raise ValueError(f"{self.name}: errors must not be NaN, and there must be an object")
+        if self.evidence is not None and len(self.evidence.body) != len(self.entropy):
+            raise ValueError(f"{self.name}: evidence is of {len(self.evidence.body)} views, not {len(self.entropy)}")
 
 
 def observe_scene(
@@ -101,10 +111,13 @@ def observe_scene(
         grid: of the surface.
     """
     views, tables, entropy, surface = [], [], [], []
+    fusion = JointFusion(model, weights=BeliefWeights.indifferent())
     for index, position in enumerate(sphere.positions):
         view = capture(sphere.pose(position), (index + 1) * 1_000_000_000)
         hypotheses = estimator.estimate(view)
         verification = verifier.score(view.depth, view.camera, hypotheses)
+        known = view.stamp, view.T_world_camera, hypotheses, verification
+        fusion.add_view(*known, view.depth, view.camera)
         T = hypotheses.T_camera_object
         rows = [
             T[:, :3, 3],
@@ -122,7 +135,9 @@ def observe_scene(
     errors = e_add(model, world_poses(table, of_view, sphere)[:, None], T_world_object[None], cutoff=MISSED_E_ADD)
     errors[errors >= MISSED_E_ADD] = np.inf
     errors = errors.astype(np.float32)
-    return BankScene(name, T_world_object, of_view, table, errors, np.array(entropy), np.stack(surface))
+    return BankScene(
+        name, T_world_object, of_view, table, errors, np.array(entropy), np.stack(surface), tabulate(fusion)
+    )
 
 
 def view_entropy(segmentation: np.ndarray) -> float:
@@ -244,6 +259,8 @@ class SceneBank:
             "provenance": self.provenance,
         }
         pairs = [np.nonzero(np.isfinite(scene.errors)) for scene in self.scenes]
+        evidence = [scene.evidence for scene in self.scenes if scene.evidence is not None]
+        tables: dict[str, Any] = _evidence_arrays(evidence) if len(evidence) == len(self.scenes) > 0 else {}
         with atomic_file(path) as unfinished:
             np.savez_compressed(
                 unfinished,
@@ -260,6 +277,7 @@ class SceneBank:
                 # View by view for each cell: a cell is mostly seen from many neighbouring views or from none, which
                 # compresses to a fraction of what cell by cell for each view does.
                 surface=[_transpose_bits(scene.surface, len(self.grid)) for scene in self.scenes],
+                **tables,
             )
 
 
@@ -299,7 +317,7 @@ def load_bank(path: Path) -> SceneBank:
     try:
         data = read_archive(path)
         header = parse_json(str(data["header"]))
-        if header["format"] != FORMAT:
+        if header["format"] not in (FORMAT, _WITHOUT_EVIDENCE):
             raise ValueError(f"format {header['format']}, this version reads {FORMAT}")
         sphere = ViewSphere(header["radius"], tuple(header["elevations_degrees"]), header["azimuths"])
         surface = header["surface"]
@@ -325,6 +343,16 @@ def _check_counts(data: dict[str, np.ndarray], scenes: int, views: int) -> None:
         # As Python's integers, which do not overflow.
         if sum(data[count].ravel().tolist()) != len(data[table]):
             raise ValueError(f"{count} does not add up to the {len(data[table])} rows of {table}")
+    if "candidate_count" in data:
+        found = data["candidate_count"]
+        if found.shape != (scenes,) or found.dtype.kind != "i" or (found < 0).any():
+            raise ValueError(f"candidate_count must be {(scenes,)} numbers from 0")
+        if any(
+            sum(found.tolist()) != len(data[name])
+            for name in data
+            if name.startswith("candidate_") and name != "candidate_count"
+        ):
+            raise ValueError("candidate_count does not add up to the rows of the tables")
     largest = (data["object_count"] * data["hypothesis_count"].sum(axis=1)).max(initial=0)
     if largest > _MOST_PAIRS:
         raise ValueError(f"a scene has {largest} pairs of hypotheses and objects, at most {_MOST_PAIRS} are read")
@@ -351,7 +379,35 @@ def _read_scene(data: dict[str, np.ndarray], index: int, name: str) -> BankScene
         errors,
         data["entropy"][index],
         _transpose_bits(data["surface"][index], per_view.shape[1]),
+        _read_evidence(data, part(data["candidate_count"])) if "candidate_count" in data else None,
     )
+
+
+def _evidence_arrays(evidence: Sequence[EvidenceTables]) -> dict[str, np.ndarray]:
+    """The tables of all scenes, candidates one after the other; poses without their last row."""
+    arrays: dict[str, Any] = {"candidate_count": [len(tables.place) for tables in evidence]}
+    for name in ("T_world_body", "T_world_object"):
+        rows = np.concatenate([getattr(tables, name) for tables in evidence])
+        arrays[f"candidate_{name}"] = rows[..., :3, :].astype(np.float32)
+    arrays["candidate_place"] = np.concatenate([tables.place for tables in evidence]).astype(np.int16)
+    for name in ("body", "twin", "telling"):
+        # Views last: neighbouring views say the same of a candidate, which compresses well.
+        arrays[f"candidate_{name}"] = np.concatenate([np.moveaxis(getattr(t, name), 0, -1) for t in evidence])
+    return arrays
+
+
+def _read_evidence(data: dict[str, np.ndarray], part: slice) -> EvidenceTables:
+    """The inverse of :func:`_evidence_arrays` for one scene."""
+    poses = []
+    for name in ("T_world_body", "T_world_object"):
+        rows = data[f"candidate_{name}"][part].astype(float)
+        last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*rows.shape[:-2], 1, 4))
+        poses.append(np.concatenate([rows, last], axis=-2))
+    roots = (
+        np.ascontiguousarray(np.moveaxis(data[f"candidate_{name}"][part], -1, 0))
+        for name in ("body", "twin", "telling")
+    )
+    return EvidenceTables(poses[0], data["candidate_place"][part].astype(int), poses[1], *roots)
 
 
 def _transpose_bits(packed: np.ndarray, count: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion, FusedBatch
+from active6d_agent.bank.scene_lookup import FusedBatch, SceneLookup
 from active6d_agent.environment.rollout import score_fused
 from active6d_agent.policies.attention.encoding import decode, encode
 from active6d_core.metrics import DETECTION_FRACTION
@@ -68,7 +68,7 @@ class Episodes:
 
     def __init__(
         self,
-        lookup: BatchedFusion,
+        lookup: SceneLookup,
         count: int,
         steps: int = 5,
         reward: RewardParameters | None = None,

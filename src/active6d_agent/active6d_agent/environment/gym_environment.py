@@ -9,8 +9,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.joint_lookup import make_lookup
 from active6d_agent.bank.scene_bank import SceneBank, load_bank
+from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.episodes import Episodes
 from active6d_agent.policies.attention.encoding import FEATURES
 from active6d_agent.policies.registry import MAX_OBJECTS
@@ -66,7 +67,7 @@ class Active6DEnv(gym.Env):
 
     metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's interface)
 
-    def __init__(self, bank: BatchedFusion | SceneBank | str | Path, **settings: Any) -> None:
+    def __init__(self, bank: SceneLookup | SceneBank | str | Path, **settings: Any) -> None:
         self.episodes = Episodes(_open(bank), 1, **settings)
         self.observation_space, self.action_space = make_spaces(self.episodes.steps)
 
@@ -107,7 +108,7 @@ class Active6DVectorEnv(VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012  (Gymnasium's interface)
 
-    def __init__(self, bank: BatchedFusion | SceneBank | str | Path, num_envs: int = 1, **settings: Any) -> None:
+    def __init__(self, bank: SceneLookup | SceneBank | str | Path, num_envs: int = 1, **settings: Any) -> None:
         self.num_envs = num_envs
         self.episodes = Episodes(_open(bank), num_envs, **settings)
         self.single_observation_space, self.single_action_space = make_spaces(self.episodes.steps)
@@ -135,7 +136,7 @@ class Active6DVectorEnv(VectorEnv):
         return self.episodes.observe(), reward, done, np.zeros_like(done), info
 
 
-def _open(bank: BatchedFusion | SceneBank | str | Path) -> BatchedFusion:
-    if isinstance(bank, BatchedFusion):
+def _open(bank: SceneLookup | SceneBank | str | Path) -> SceneLookup:
+    if isinstance(bank, SceneLookup):
         return bank
-    return BatchedFusion(bank if isinstance(bank, SceneBank) else load_bank(Path(bank)))
+    return make_lookup(bank if isinstance(bank, SceneBank) else load_bank(Path(bank)))

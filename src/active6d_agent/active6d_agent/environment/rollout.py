@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion, FusedBatch
+from active6d_agent.bank.scene_lookup import FusedBatch, SceneLookup
 from active6d_agent.policies.registry import Observation
 
 MEASURES = ("detection_rate", "e_add_mm", "distance_m")
@@ -46,7 +46,7 @@ class EpisodeResults:
 
 
 def roll_out(
-    lookup: BatchedFusion,
+    lookup: SceneLookup,
     choose: Choose,
     scene: np.ndarray,
     start: np.ndarray,
@@ -82,7 +82,7 @@ def roll_out(
 
 
 def observe(
-    lookup: BatchedFusion,
+    lookup: SceneLookup,
     scene: np.ndarray,
     views: np.ndarray,
     left: np.ndarray,
@@ -116,13 +116,13 @@ def observe(
     return observations
 
 
-def measure(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
+def measure(lookup: SceneLookup, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
     """Score (E, v) views, -1 padding, taken in order."""
     last = np.take_along_axis(views, (views >= 0).sum(axis=1, keepdims=True) - 1, axis=1)[:, 0]
     return score_fused(lookup, lookup.fuse(scene, views, last), scene, views)
 
 
-def score_fused(lookup: BatchedFusion, fused: FusedBatch, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
+def score_fused(lookup: SceneLookup, fused: FusedBatch, scene: np.ndarray, views: np.ndarray) -> EpisodeResults:
     """Score what fusion made of (E, v) views, -1 padding, taken in order."""
     scores = lookup.evaluate(fused, scene)
     positions = lookup.sphere.positions[views]

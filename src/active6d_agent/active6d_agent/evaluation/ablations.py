@@ -13,6 +13,7 @@ import numpy as np
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import SceneBank
+from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.evaluation.policy_evaluation import Intervals, describe, run_named
 from active6d_agent.policies.attention.network import ATTENTION_RULES
@@ -33,7 +34,7 @@ PLANNING = {
 
 
 def ablate_steps(
-    lookup: BatchedFusion,
+    lookup: SceneLookup,
     names: Sequence[str],
     starts: np.ndarray,
     steps: Sequence[int] = STEPS,
@@ -61,7 +62,7 @@ def ablate_steps(
 
 
 def ablate_planning(
-    lookup: BatchedFusion, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict[str, Any] | None = None
+    lookup: SceneLookup, starts: np.ndarray, steps: int, *, seed: int = 0, parameters: dict[str, Any] | None = None
 ) -> Iterator[dict[str, Any]]:
     """``view-attention`` as it is, then with one parameter of :data:`PLANNING` set, then Random; nothing is trained.
 
@@ -126,7 +127,7 @@ def ablate_fusion(
         first = first or measures
 
 
-def _score_views(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> dict[str, np.ndarray]:
+def _score_views(lookup: SceneLookup, scene: np.ndarray, views: np.ndarray) -> dict[str, np.ndarray]:
     """What (E, v) views amount to under a look-up's fusion, episode by episode."""
     fused = lookup.fuse(scene, views, views[np.arange(len(views)), (views >= 0).sum(axis=1) - 1])
     counts = lookup.object_count[scene]
@@ -162,7 +163,7 @@ def training_variants(
 
 
 def ablate_training(
-    banks: dict[str, BatchedFusion],
+    banks: dict[str, SceneLookup],
     variants: dict[str, tuple[PpoParameters, RewardParameters]],
     folder: Path,
     starts: np.ndarray,

@@ -12,6 +12,7 @@ import numpy as np
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.scene_bank import SceneBank
+from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.rollout import measure
 from active6d_agent.evaluation.oracle import worth
 from active6d_agent.evaluation.policy_evaluation import Intervals, Measures, describe, run_named
@@ -19,7 +20,7 @@ from active6d_core.view_sphere import ViewSphere
 
 
 def ablate_noise_resampling(
-    lookups: tuple[BatchedFusion, BatchedFusion],
+    lookups: tuple[SceneLookup, SceneLookup],
     names: Sequence[str],
     starts: np.ndarray,
     steps: int,
@@ -53,7 +54,7 @@ def ablate_noise_resampling(
         own = (parameters or {}).get(name)
         return [run_named(lookup, name, starts, steps, seed=seed, parameters=own).views for lookup in lookups]
 
-    def score(views: list[np.ndarray], noise: Sequence[BatchedFusion] = lookups) -> Measures:
+    def score(views: list[np.ndarray], noise: Sequence[SceneLookup] = lookups) -> Measures:
         ways = [measure(lookup, scene, own).measures for lookup, own in zip(noise, views, strict=True)]
         return {key: np.mean([way[key] for way in ways], axis=0) for key in ways[0]}
 
@@ -94,7 +95,7 @@ def _refuse_other_scenes(bank: SceneBank, other: SceneBank) -> None:
         )
 
 
-def join_banks(bank: SceneBank, other: SceneBank) -> BatchedFusion:
+def join_banks(bank: SceneBank, other: SceneBank) -> SceneLookup:
     """One look-up of two banks of the same scenes: view ``v`` of the second bank is view ``M + v``."""
     grid = bank.sphere
     twice = ViewSphere(grid.radius, grid.elevations_degrees * 2, grid.azimuths)
@@ -106,13 +107,14 @@ def join_banks(bank: SceneBank, other: SceneBank) -> BatchedFusion:
             errors=np.concatenate([first.errors, second.errors]),
             entropy=np.concatenate([first.entropy, second.entropy]),
             surface=np.concatenate([first.surface, second.surface]),
+            evidence=None,
         )
         for first, second in zip(bank.scenes, other.scenes, strict=True)
     ]
     return BatchedFusion(replace(bank, sphere=twice, scenes=scenes))
 
 
-def search_unforeseen(joined: BatchedFusion, starts: np.ndarray, steps: int) -> np.ndarray:
+def search_unforeseen(joined: SceneLookup, starts: np.ndarray, steps: int) -> np.ndarray:
     """(E, T + 1) views of a greedy search that knows the ground truth but not the noise of its next image.
 
     Args:

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_core.metrics import DETECTION_FRACTION, MISSED_E_ADD
 
 # Candidates scored in one call: enough to be fast, few enough to stay in memory.
 _CHUNK = 4096
 
 
-def known(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
+def known(lookup: SceneLookup, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
     """(E, o, 2) for every true object after (E, v) views, -1 padding: 1 if it is detected, and 1 - ADD / 50 mm.
 
     Zeros beyond a scene's own objects.
@@ -24,19 +24,19 @@ def known(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.nda
     return np.concatenate(parts)
 
 
-def tally(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
+def tally(lookup: SceneLookup, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
     """(E, 2) the sums of :func:`known` over the objects."""
     return known(lookup, scene, views).sum(axis=1)
 
 
-def worth(lookup: BatchedFusion, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
+def worth(lookup: SceneLookup, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
     """(E,) number of objects detected after (E, v) views, plus less than one for a small mean error."""
     detected, closeness = tally(lookup, scene, views).T
     return detected + 0.999 * closeness / lookup.object_count[scene]
 
 
 def search_views(
-    lookup: BatchedFusion, scene: int, start: int, steps: int, *, width: int = 1, allowed: np.ndarray | None = None
+    lookup: SceneLookup, scene: int, start: int, steps: int, *, width: int = 1, allowed: np.ndarray | None = None
 ) -> np.ndarray:
     """The best views that a search with the ground truth finds, greedy or with a beam.
 

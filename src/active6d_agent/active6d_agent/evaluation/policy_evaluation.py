@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.rollout import EpisodeResults, measure, roll_out
 from active6d_agent.evaluation.oracle import search_views
 from active6d_agent.policies.registry import Observation, Policy, create_policy
@@ -19,7 +19,7 @@ _TOGETHER = 100
 Measures = dict[str, np.ndarray]
 
 
-def all_starts(lookup: BatchedFusion, sample: int | None = None, seed: int = 0) -> np.ndarray:
+def all_starts(lookup: SceneLookup, sample: int | None = None, seed: int = 0) -> np.ndarray:
     """(E, 2) scenes and first views: every pair, or ``sample`` of them drawn without replacement."""
     scenes, views = len(lookup.bank.scenes), len(lookup.sphere)
     pairs = np.stack(np.unravel_index(np.arange(scenes * views), (scenes, views)), axis=1)
@@ -29,7 +29,7 @@ def all_starts(lookup: BatchedFusion, sample: int | None = None, seed: int = 0) 
 
 
 def run_policy(
-    lookup: BatchedFusion,
+    lookup: SceneLookup,
     make_policy: Callable[[int], Policy],
     starts: np.ndarray,
     steps: int,
@@ -64,7 +64,7 @@ def run_policy(
 
 
 def run_named(
-    lookup: BatchedFusion,
+    lookup: SceneLookup,
     name: str,
     starts: np.ndarray,
     steps: int,
@@ -99,7 +99,7 @@ def run_named(
     return run_policy(lookup, make, starts, steps, seed=seed)
 
 
-def _all_views(lookup: BatchedFusion, starts: np.ndarray) -> EpisodeResults:
+def _all_views(lookup: SceneLookup, starts: np.ndarray) -> EpisodeResults:
     """Every view of the grid in its order from the first on; fused once for each scene, as order does not matter."""
     grid = np.arange(len(lookup.sphere))
     scenes, inverse = np.unique(starts[:, 0], return_inverse=True)
@@ -153,7 +153,7 @@ class Intervals:
 
 
 def evaluate(
-    lookup: BatchedFusion,
+    lookup: SceneLookup,
     names: Sequence[str],
     steps: int,
     starts: np.ndarray,

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, describe, run_named
 from active6d_agent.policies.registry import weights_path
 
 
 def compare_seeds(
-    validation: BatchedFusion,
-    test: BatchedFusion,
+    validation: SceneLookup,
+    test: SceneLookup,
     weights: dict[tuple[str, int], Path],
     starts: np.ndarray,
     steps: int,

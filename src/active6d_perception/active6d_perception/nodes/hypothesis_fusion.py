@@ -70,7 +70,7 @@ class HypothesisFusionNode(GraphNode):
         self.declare(
             "method",
             METHODS[0],
-            "what an object's pose follows from: the best hypothesis of one view, or the depth images of all views",
+            "what an object's pose follows from: the depth images of all views, or the best hypothesis of one view",
             choices=METHODS,
         )
         self.declare(

@@ -102,10 +102,16 @@ def fit_belief(episodes: Sequence[LabelledPlaces], seed: int = 0) -> tuple[Score
         raise ValueError("no pose of any object is right: fusion cannot be fitted to this estimator")
     first = np.cumsum([0, *(episode.place.max(initial=-1) + 1 for episode in episodes)])
     place = np.concatenate([episode.place + start for episode, start in zip(episodes, first, strict=False)])
-    rotations, bodies, right = (
-        torch.from_numpy(np.concatenate([getattr(episode, name) for episode in episodes]))
-        for name in ("rotations", "bodies", "right")
+    # Objects differ in the number of rotations; repeating all of an object's changes none of its probabilities.
+    most = max(episode.right.shape[1] for episode in episodes)
+    repeated = [np.arange(most) % episode.right.shape[1] for episode in episodes]
+    rotations, right = (
+        torch.from_numpy(
+            np.concatenate([getattr(each, name)[:, turn] for each, turn in zip(episodes, repeated, strict=True)])
+        )
+        for name in ("rotations", "right")
     )
+    bodies = torch.from_numpy(np.concatenate([episode.bodies for episode in episodes]))
     starts = np.searchsorted(place, np.arange(first[-1] + 1))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -70,6 +70,24 @@ class BodyRefinement:
         return memo.rows([(gate, id(self._samples), key) for key in keys], compute)
 
 
+def refine_poses(
+    T_world_object: np.ndarray,
+    samples: VisibleSamples,
+    views: Sequence[MeasuredView],
+    gates: tuple[float, ...],
+    *,
+    search: bool,
+) -> np.ndarray:
+    """:meth:`BodyRefinement.refine` without rounding and without remembering anything."""
+    T = np.array(T_world_object, float)
+    for gate in gates:
+        total = np.zeros((len(T), _COLUMNS))
+        for view in views:
+            total += normal_equations(T, samples, view, gate, search)
+        T = _step(T, T, total)
+    return T
+
+
 def _step(T: np.ndarray, rounded: np.ndarray, equations: np.ndarray) -> np.ndarray:
     """Gauss-Newton step from (k, 4, 4) rounded poses by (k, columns) equations; ``T`` where there are too few pairs."""
     A = np.zeros((len(T), _SIZE, _SIZE))

@@ -21,8 +21,9 @@ from active6d_perception.scene.hypothesis_table import HypothesisTable, confiden
 from active6d_perception.scene.observed_surface import EXPLAINED_WITHIN
 from active6d_perception.suppression import suppress_neighbours
 
-#: How views are fused: the best hypothesis of a single view, or all depth images together (:class:`.JointFusion`).
-METHODS = ("best-view", "all-views")
+#: How views are fused, the default first: all depth images together (:class:`.JointFusion`), or as in the paper, by the
+#: best hypothesis of a single view (:class:`SceneFusion`).
+METHODS = ("all-views", "best-view")
 #: Ways to rank hypotheses, see :class:`FusionParameters`.
 RANKINGS = ("evidence", "confidence", "verification", "score")
 

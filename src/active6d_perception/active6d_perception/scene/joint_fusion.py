@@ -37,15 +37,15 @@ from active6d_perception.scene.rotation_belief import PlaceBeliefs, decide, post
 from active6d_perception.scene.scene_evidence import BodyEvidence, SceneEvidence
 from active6d_perception.suppression import suppress_neighbours
 
-# An instance whose body's middle is nearer than this to a candidate's is the candidate's own, diameters.
-_OWN = 0.25
-# Bodies whose middles are farther apart than this do not touch, diameters.
-_BESIDE = 1.3
+#: An instance whose body's middle is nearer than this to a candidate's is the candidate's own, diameters.
+OWN_PLACE = 0.25
+#: Bodies whose middles are farther apart than this do not touch, diameters.
+BESIDE = 1.3
 # Refinement, metres: gates of the steps, and the lattice. Bodies are many and only compared; what is reported is finer.
 _BODY_GATES, _BODY_LATTICE = (0.008, 0.004, 0.004), 0.002
-_WHOLE_GATES, _WHOLE_LATTICE = (0.008, 0.004), 0.0005
-# A body whose log-odds are this far below those of the best at its place is dropped.
-_HOPELESS = 12.0
+WHOLE_GATES, _WHOLE_LATTICE = (0.008, 0.004), 0.0005
+#: A body whose log-odds are this far below those of the best at its place is dropped.
+HOPELESS = 12.0
 # Evidence is taken at poses on this lattice, metres.
 _LATTICE = 0.001
 
@@ -109,7 +109,19 @@ class JointFusion:
         self._tray = tray or Tray.for_model(model)
         self._known = HypothesisTable(self.ambiguity.body_distance.between)
         self._bodies = BodyRefinement(self.ambiguity.body_samples, _BODY_GATES, _BODY_LATTICE)
-        self._whole = BodyRefinement(self.ambiguity.all_samples, _WHOLE_GATES, _WHOLE_LATTICE, search=False)
+        self._whole = BodyRefinement(self.ambiguity.all_samples, WHOLE_GATES, _WHOLE_LATTICE, search=False)
+        self.reset()
+        self._compile()
+
+    def _compile(self) -> None:
+        """Call every compiled function once, so that no view has to wait."""
+        camera, depth = PinholeCamera(8, 8, 8.0, 8.0, 3.5, 3.5), np.full((8, 8), 0.5, np.float32)
+        pose = np.eye(4)
+        pose[2, 3] = 0.5
+        mask = np.ones((8, 8), np.uint16)
+        hypotheses = Hypotheses.from_masks(pose[None], np.ones(1), np.ones(1), mask, depth)
+        self.add_view(0, np.eye(4), hypotheses, np.ones(1), depth, camera)
+        self.objects(0, np.eye(4), camera)
         self.reset()
 
     @property
@@ -164,7 +176,7 @@ class JointFusion:
         ambiguity, same = self.ambiguity, np.eye(4)[None]
         whole = _Part("body", same, ambiguity.body_points, ambiguity.body_samples)
         twins = _Part("twin", same, ambiguity.body_points, ambiguity.twin_samples)
-        candidates = self._candidates(self._order())
+        candidates = self.candidates()
         heads = _rounded(candidates.take(candidates.heads()))
         bodies = BodyEvidence(
             candidates,
@@ -192,7 +204,7 @@ class JointFusion:
         log_odds, place = self.weights.body(bodies.columns()), bodies.candidates.place
         best = np.full(place.max(initial=-1) + 1, -np.inf)
         np.maximum.at(best, place, log_odds)
-        return np.flatnonzero(log_odds > best[place] - _HOPELESS)
+        return np.flatnonzero(log_odds > best[place] - HOPELESS)
 
     def _order(self) -> np.ndarray:
         known = self._known
@@ -201,8 +213,9 @@ class JointFusion:
     def _sorted_views(self) -> list[_SeenView]:
         return [self._views[stamp] for stamp in sorted(self._views)]
 
-    def _candidates(self, order: np.ndarray) -> BodyCandidates:
-        known, ambiguity = self._known, self.ambiguity
+    def candidates(self) -> BodyCandidates:
+        """The refined bodies that the hypotheses of all views propose, with their twins."""
+        known, ambiguity, order = self._known, self.ambiguity, self._order()
         distances = known.distances.take(order, axis=0).take(order, axis=1)
         labels = cluster(distances, self.parameters.cut * ambiguity.diameter) if len(order) else order
         table = known.table[order]
@@ -223,7 +236,7 @@ class JointFusion:
         for view in self._views.values():
 
             def compute(missing: np.ndarray, view: _SeenView = view) -> np.ndarray:
-                place = _OWN * ambiguity.diameter
+                place = OWN_PLACE * ambiguity.diameter
                 return count_cases(
                     rounded[missing], part.rotations, ambiguity.middle, place, part.samples, view.measured
                 )
@@ -249,7 +262,7 @@ class JointFusion:
         middles, others = (transform_points(T, ambiguity.middle[None])[:, 0] for T in (rounded, heads[0]))
         apart = np.linalg.norm(middles[:, None] - others, axis=-1)
         other = candidates.place[:, None] != np.arange(len(others))
-        own, neighbour = np.nonzero(other & (apart < _BESIDE * ambiguity.diameter))
+        own, neighbour = np.nonzero(other & (apart < BESIDE * ambiguity.diameter))
 
         def compute(missing: np.ndarray) -> np.ndarray:
             pair = rounded[own[missing]], heads[0][neighbour[missing]]
@@ -282,7 +295,7 @@ class JointFusion:
         T = self.poses(evidence, beliefs)
         known, ambiguity = self._known, self.ambiguity
         table, stamps, hypotheses = known.table[order], known.stamp[order], known.T_world_object[order]
-        members = self._members(T, hypotheses)
+        apart, members = self._members(T, hypotheses)
         description = describe_objects(evidence, beliefs, members, table[:, 1], stamps)
         probability = expit(self.weights.probability(description))
         first = np.argsort(-probability, kind="stable")
@@ -291,13 +304,12 @@ class JointFusion:
         kept = first[suppress_neighbours(T[first, :3, 3][None], np.ones((1, len(first)), bool), apart_enough)[0]]
         box, depth = project_features(ambiguity.views, invert(T_world_camera) @ T[kept], camera)
         columns = []
-        distances = known.distances.take(order, axis=0).take(order, axis=1)
         for row, own in enumerate(members[kept]):
             mine = np.flatnonzero(own)
             now = mine[stamps[mine] == stamp]
             if len(now):
                 box[row], depth[row] = table[now[0], 2:6], table[now[0], 6]
-            columns.append((*table[mine[0], :2], len(np.unique(stamps[mine])), distances[np.ix_(mine, mine)].max()))
+            columns.append((*table[mine[0], :2], len(np.unique(stamps[mine])), apart[kept[row], mine].max()))
         verification, score, support, spread = np.array(columns).reshape(-1, 4).T
         objects = SceneObjects(
             T[kept],
@@ -312,20 +324,22 @@ class JointFusion:
         )
         return JointObjects(objects, description[kept])
 
-    def _members(self, T_world_object: np.ndarray, hypotheses: np.ndarray) -> np.ndarray:
-        """(n, h) bool, which of (h, 4, 4) hypotheses stand for each of (n, 4, 4) objects: those of its body.
+    def _members(self, T_world_object: np.ndarray, hypotheses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n, h) distances of the bodies of (n, 4, 4) objects from those of (h, 4, 4) hypotheses, metres, and (n, h)
+        bool, which hypotheses stand for each object: those of its body.
 
         A twin that no hypothesis is of has the hypothesis with the nearest middle.
         """
         ambiguity = self.ambiguity
         cut = self.parameters.cut * ambiguity.diameter
-        members = ambiguity.body_distance.between(T_world_object, hypotheses) < cut
+        apart = ambiguity.body_distance.between(T_world_object, hypotheses)
+        members = apart < cut
         alone = np.flatnonzero(~members.any(axis=1))
         middles, others = (
             transform_points(T, ambiguity.middle[None])[:, 0] for T in (T_world_object[alone], hypotheses)
         )
         members[alone, np.linalg.norm(middles[:, None] - others, axis=-1).argmin(axis=1)] = True
-        return members
+        return apart, members
 
     def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
         """The objects of all views so far, most probable first; arguments and features as for

@@ -16,9 +16,10 @@ from active6d_perception.scene.measured_cases import (
     WHOSE,
 )
 
-# Millimetres off are errors of poses, not of the hypothesis: depths count up to these, metres.
-_DEEPEST_IN_CONTAINER, _DEEPEST_IN_NEIGHBOUR = 0.03, 0.005
-_TOUCHES_FLOOR, _TOUCHES_NEIGHBOUR = 0.003, 0.0015
+#: Millimetres off are errors of poses, not of the hypothesis: depths count up to these, metres.
+DEEPEST_IN_CONTAINER, DEEPEST_IN_NEIGHBOUR = 0.03, 0.005
+#: Distances within which two surfaces touch, metres.
+TOUCHES_FLOOR, TOUCHES_NEIGHBOUR = 0.003, 0.0015
 
 #: Names of the columns of :meth:`SceneEvidence.columns`.
 ROTATION_COLUMNS = (
@@ -141,9 +142,9 @@ class SceneEvidence:
             10 * self.neighbours[..., 0],
             10 * self.container[..., 2],
             *_depths(floor, near),
-            np.clip(wall, 0, _DEEPEST_IN_CONTAINER) / 0.01,
-            np.abs(floor) < _TOUCHES_FLOOR,
-            np.abs(near) < _TOUCHES_NEIGHBOUR,
+            np.clip(wall, 0, DEEPEST_IN_CONTAINER) / 0.01,
+            np.abs(floor) < TOUCHES_FLOOR,
+            np.abs(near) < TOUCHES_NEIGHBOUR,
             height / (0.4 * self.diameter),
         ]
         return np.concatenate([_roots(self.telling), np.stack(columns, axis=-1)], axis=-1).astype(np.float32)
@@ -156,5 +157,5 @@ def _roots(counts: np.ndarray) -> np.ndarray:
 
 def _depths(lowest: np.ndarray, nearest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How deep an object reaches below the floor, in centimetres, and into a neighbour, in millimetres."""
-    below = np.clip(-lowest, 0, _DEEPEST_IN_CONTAINER) / 0.01
-    return below, np.clip(-nearest, 0, _DEEPEST_IN_NEIGHBOUR) / 0.001
+    below = np.clip(-lowest, 0, DEEPEST_IN_CONTAINER) / 0.01
+    return below, np.clip(-nearest, 0, DEEPEST_IN_NEIGHBOUR) / 0.001

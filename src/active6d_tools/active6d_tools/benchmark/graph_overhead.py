@@ -208,11 +208,11 @@ def _summary(times: dict[str, list[np.ndarray]]) -> dict[str, float]:
 def _direct(prepared: PreparedViews) -> tuple[np.ndarray, np.ndarray]:
     """Seconds per view of the core functions, and the part of verification and fusion."""
     from active6d_agent.policies.registry import Observation, create_policy
-    from active6d_perception.scene.fusion import SceneFusion
+    from active6d_perception.scene.joint_fusion import JointFusion
     from active6d_perception.scene.observed_surface import ObservedSurface
     from active6d_perception.scene.verification import Verifier
 
-    verifier, fusion, surface = Verifier(prepared.model), SceneFusion(prepared.model), ObservedSurface(prepared.model)
+    verifier, fusion, surface = Verifier(prepared.model), JointFusion(prepared.model), ObservedSurface(prepared.model)
     policy, sphere = create_policy("lowest-score", prepared.model), ViewSphere()
     policy.reset(np.random.default_rng(0))
     allowed, positions = np.ones(len(sphere), bool), []
@@ -221,7 +221,7 @@ def _direct(prepared: PreparedViews) -> tuple[np.ndarray, np.ndarray]:
         began = time.perf_counter()
         found = prepared.hypotheses[view.stamp]
         scores = verifier.score(view.depth, view.camera, found)
-        fusion.add_view(view.stamp, view.T_world_camera, found, scores)
+        fusion.add_view(view.stamp, view.T_world_camera, found, scores, view.depth, view.camera)
         surface.add_view(view.stamp, view.depth, view.camera, view.T_world_camera)
         objects = fusion.objects(view.stamp, view.T_world_camera, view.camera)
         unexplained = surface.unexplained(objects.T_world_object)

@@ -26,7 +26,7 @@ from active6d_tools.cli.terminal import messages, print_table, progress_bar
 if TYPE_CHECKING:
     import numpy as np
 
-    from active6d_agent.bank.batched_fusion import BatchedFusion
+    from active6d_agent.bank.scene_lookup import SceneLookup
 
 
 class Part(StrEnum):
@@ -82,6 +82,7 @@ def ablate(
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """
     from active6d_agent.bank.batched_fusion import BatchedFusion
+    from active6d_agent.bank.joint_lookup import make_lookup
     from active6d_agent.bank.scene_bank import load_bank
     from active6d_agent.evaluation.policy_evaluation import all_starts
     from active6d_agent.evaluation.training_seeds import compare_seeds, mark_best
@@ -91,7 +92,9 @@ def ablate(
     paths = _find_banks(part, object_name, banks)
     parameters = parse_overrides(override or [])
     with messages.status("reading the banks"):
-        lookups = {split: BatchedFusion(load_bank(path)) for split, path in paths.items()}
+        # Candidates of all views cannot be joined from two banks of one scene.
+        make = BatchedFusion if part is Part.NOISE_RESAMPLING else make_lookup
+        lookups = {split: make(load_bank(path)) for split, path in paths.items()}
     starts = all_starts(lookups["test"], sample, seed)
     names = [name.strip() for name in policies.split(",")]
     if part in _TRAINED:
@@ -128,7 +131,7 @@ def _folder(out: Path | None, kind: str, object_name: str) -> Path:
 
 def _train_variants(
     part: Part,
-    lookups: dict[str, "BatchedFusion"],
+    lookups: dict[str, "SceneLookup"],
     folder: Path,
     steps: int,
     length: int,
@@ -150,7 +153,7 @@ def _train_variants(
 
 def _evaluate_variants(
     part: Part,
-    lookups: dict[str, "BatchedFusion"],
+    lookups: dict[str, "SceneLookup"],
     names: list[str],
     starts: "np.ndarray",
     steps: int,
@@ -179,10 +182,10 @@ def _evaluate_variants(
 
 
 def _train_seeds(
-    validation: "BatchedFusion", folder: Path, steps: int, banks: Path | None
+    validation: "SceneLookup", folder: Path, steps: int, banks: Path | None
 ) -> dict[tuple[str, int], Path]:
     """Weights of every learned policy and seed; missing ones are trained as by ``active6d train policy``."""
-    from active6d_agent.bank.batched_fusion import BatchedFusion
+    from active6d_agent.bank.joint_lookup import make_lookup
     from active6d_agent.bank.scene_bank import find_bank, load_bank
     from active6d_tools.policy_training import plan_training
 
@@ -193,7 +196,7 @@ def _train_seeds(
     }
     missing = {key: training for key, training in trainings.items() if not training.best.is_file()}
     if missing:
-        train = BatchedFusion(load_bank(find_bank(validation.model.name, "train", banks)))
+        train = make_lookup(load_bank(find_bank(validation.model.name, "train", banks)))
         for (name, seed), training in missing.items():
             follow_training(training, [train, validation], f"{name}, {validation.model.name}, seed {seed}")
     return {key: training.best for key, training in trainings.items()}

@@ -76,7 +76,7 @@ def _evaluate_bank(
     seed: int,
     json_file: Path | None,
 ) -> None:
-    from active6d_agent.bank.batched_fusion import BatchedFusion
+    from active6d_agent.bank.joint_lookup import make_lookup
     from active6d_agent.bank.scene_bank import find_bank, load_bank
     from active6d_agent.evaluation.policy_evaluation import all_starts, summarise
     from active6d_agent.evaluation.policy_evaluation import evaluate as run_all
@@ -89,7 +89,7 @@ def _evaluate_bank(
         raise ValueError(f"--steps {steps}: the grid of {len(bank.sphere)} views leaves {len(bank.sphere) - 1} moves")
     names = usable_policies(policies, bank, parameters)
     with messages.status("reading the bank"):
-        lookup = BatchedFusion(bank)
+        lookup = make_lookup(bank)
     starts = all_starts(lookup, sample, seed)
     with progress_bar() as progress:
         task = progress.add_task("evaluating", total=len(names) * len(starts))

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 from active6d_tools.cli.terminal import console, progress_bar
 
 if TYPE_CHECKING:
-    from active6d_agent.bank.batched_fusion import BatchedFusion
+    from active6d_agent.bank.scene_lookup import SceneLookup
     from active6d_tools.policy_training import PolicyTraining
 
 
-def follow_training(training: "PolicyTraining", lookups: Sequence["BatchedFusion"], title: str) -> None:
+def follow_training(training: "PolicyTraining", lookups: Sequence["SceneLookup"], title: str) -> None:
     """Train on look-ups of the train and val banks; show the progress and redraw the curve."""
     from active6d_tools.report.training_curves import draw_training
 

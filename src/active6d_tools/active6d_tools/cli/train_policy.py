@@ -42,7 +42,7 @@ def policy(
 
     Example: [bold]active6d train policy --object mug --policy view-attention --export weights[/bold]
     """
-    from active6d_agent.bank.batched_fusion import BatchedFusion
+    from active6d_agent.bank.joint_lookup import make_lookup
     from active6d_agent.bank.scene_bank import find_bank, load_bank
     from active6d_core.files import cache_folder
     from active6d_tools.policy_training import plan_training
@@ -54,7 +54,7 @@ def policy(
     training = plan_training(name, folder, steps=steps, seed=seed, length=length, groups=groups, resume=resume)
     paths = [find_bank(object_name, split, banks) for split in ("train", "val")]
     with messages.status("reading the banks"):
-        lookups = [BatchedFusion(load_bank(path)) for path in paths]
+        lookups = [make_lookup(load_bank(path)) for path in paths]
     follow_training(training, lookups, f"{name}, {object_name}")
     if export is not None:
         export_weights(training.best, export, f"{name}_{object_name}")

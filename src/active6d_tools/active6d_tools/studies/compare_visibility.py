@@ -8,7 +8,7 @@ Example: python -m active6d_tools.studies.compare_visibility mug
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.joint_lookup import make_lookup
 from active6d_agent.bank.scene_bank import find_bank, load_bank
 from active6d_agent.environment.rollout import observe
 from active6d_agent.evaluation.oracle import known
@@ -41,7 +41,7 @@ def compare_true_poses(model: ObjectModel) -> None:
 
 def compare_missed(model: ObjectModel) -> None:
     """Over the grid's views, of each missed object, what the item shows that stands for it: the mean correlation."""
-    lookup, rng = BatchedFusion(load_bank(find_bank(model.name, "val"))), np.random.default_rng(0)
+    lookup, rng = make_lookup(load_bank(find_bank(model.name, "val"))), np.random.default_rng(0)
     correlations: dict[str, list[float]] = {"a hypothesis": [], "a cluster": []}
     for index in range(SPLITS["val"]):
         rendered = load_scene(model.name, "val", index).visible_fraction
@@ -49,9 +49,9 @@ def compare_missed(model: ObjectModel) -> None:
             views = rng.choice(len(lookup.sphere), (1, count), replace=False)
             scene = np.array([index])
             state = represent(observe(lookup, scene, views, np.array([1]))[0], model)
-            rows = lookup.fuse(scene, views, views[:, -1]).objects[0]
+            fused = lookup.fuse(scene, views, views[:, -1])
             missed = known(lookup, scene, views)[0, :, 0] == 0
-            for item, true in zip(*stand_for(lookup, index, rows, state.clusters), strict=True):
+            for item, true in zip(*stand_for(lookup, index, fused, state.clusters), strict=True):
                 if missed[true] and np.ptp(state.shown[item]) > 0:
                     correlation = np.corrcoef(state.shown[item], rendered[:, true])[0, 1]
                     correlations["a cluster" if state.scalars[item, 4] else "a hypothesis"].append(correlation)

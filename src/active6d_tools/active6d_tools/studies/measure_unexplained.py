@@ -6,7 +6,7 @@ Example: python -m active6d_tools.studies.measure_unexplained mug --within 0.05
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.joint_lookup import make_lookup
 from active6d_agent.bank.scene_bank import find_bank, load_bank
 from active6d_core.metrics import DETECTION_FRACTION
 from active6d_perception.scene.fusion import FusionParameters
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--within", type=float, default=within, help=text)
     arguments = parser.parse_args()
     name = arguments.object
-    lookup = BatchedFusion(load_bank(find_bank(name, "val")), FusionParameters(explained_within=arguments.within))
+    lookup = make_lookup(load_bank(find_bank(name, "val")), FusionParameters(explained_within=arguments.within))
     near = explainer(lookup.model, within)
     limit, rng = DETECTION_FRACTION * lookup.model.diameter, np.random.default_rng(0)
     shown, without, cells = [], [], []

@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.joint_lookup import make_lookup
 from active6d_agent.bank.scene_bank import find_bank, load_bank
+from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.rollout import EpisodeResults, measure
 from active6d_agent.evaluation.oracle import known
 from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, run_named
@@ -26,16 +27,16 @@ STEPS = 5
 UPDATES, BATCH = 1500, 1024
 
 
-def read_split(name: str, split: str) -> tuple[BatchedFusion, list[np.ndarray]]:
+def read_split(name: str, split: str) -> tuple[SceneLookup, list[np.ndarray]]:
     """The bank of the stored scenes, and (M, n) what each view shows of each object of each scene."""
     bank = load_bank(find_bank(name, split))
     stored = {f"{name}/{split}/{index}": index for index in range(SPLITS[split])}
     scenes = [scene for scene in bank.scenes if scene.name in stored]
     shown = [load_scene(name, split, stored[scene.name]).visible_fraction for scene in scenes]
-    return BatchedFusion(replace(bank, scenes=scenes)), shown
+    return make_lookup(replace(bank, scenes=scenes)), shown
 
 
-def describe(lookup: BatchedFusion, scene: int, shown: np.ndarray) -> torch.Tensor:
+def describe(lookup: SceneLookup, scene: int, shown: np.ndarray) -> torch.Tensor:
     """(M, n, 9) share that is seen, distance, elevation, the direction to the view in the object's frame, and the
     object's vertical."""
     T, positions = lookup.bank.scenes[scene].T_world_object, lookup.sphere.positions
@@ -48,7 +49,7 @@ def describe(lookup: BatchedFusion, scene: int, shown: np.ndarray) -> torch.Tens
     return torch.from_numpy(np.concatenate(columns, axis=-1)).float()
 
 
-def is_right(lookup: BatchedFusion, scene: int) -> torch.Tensor:
+def is_right(lookup: SceneLookup, scene: int) -> torch.Tensor:
     """(M, n) 1 where the view has a right hypothesis of the object."""
     stored = lookup.bank.scenes[scene]
     right = torch.zeros(len(lookup.sphere), len(stored.T_world_object))
@@ -57,7 +58,7 @@ def is_right(lookup: BatchedFusion, scene: int) -> torch.Tensor:
     return right
 
 
-def learn(lookup: BatchedFusion, shown: list[np.ndarray]) -> nn.Module:
+def learn(lookup: SceneLookup, shown: list[np.ndarray]) -> nn.Module:
     """A network from :func:`describe` to the logit of :func:`is_right`."""
     torch.manual_seed(0)
     inputs = torch.cat([describe(lookup, scene, each).flatten(0, 1) for scene, each in enumerate(shown)])
@@ -73,7 +74,7 @@ def learn(lookup: BatchedFusion, shown: list[np.ndarray]) -> nn.Module:
     return network
 
 
-def plan(lookup: BatchedFusion, likely: list[np.ndarray], starts: np.ndarray) -> EpisodeResults:
+def plan(lookup: SceneLookup, likely: list[np.ndarray], starts: np.ndarray) -> EpisodeResults:
     """Always to the view with the most right hypotheses to be expected of objects that are not detected yet."""
     views = starts[:, 1:]
     for _ in range(STEPS):

@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.environment.gym_environment import Active6DVectorEnv, horizon
 from active6d_agent.environment.rollout import measure, roll_out
@@ -225,8 +225,8 @@ class Progress:
 
 
 def train_ppo(
-    train: BatchedFusion,
-    validation: BatchedFusion,
+    train: SceneLookup,
+    validation: SceneLookup,
     folder: Path,
     parameters: PpoParameters | None = None,
     reward: RewardParameters | None = None,
@@ -276,7 +276,7 @@ def train_ppo(
         yield progress
 
 
-def _make_ppo(lookup: BatchedFusion, parameters: PpoParameters, reward: RewardParameters) -> PPO:
+def _make_ppo(lookup: SceneLookup, parameters: PpoParameters, reward: RewardParameters) -> PPO:
     environment = BankVecEnv(Active6DVectorEnv(lookup, parameters.environments, steps=parameters.steps, reward=reward))
     return PPO(
         PaperPolicy,
@@ -292,7 +292,7 @@ def _make_ppo(lookup: BatchedFusion, parameters: PpoParameters, reward: RewardPa
     )
 
 
-def validate(network: AttentionNetwork, lookup: BatchedFusion, steps: int) -> tuple[float, float, float]:
+def validate(network: AttentionNetwork, lookup: SceneLookup, steps: int) -> tuple[float, float, float]:
     """Detection rate, ADD (mm) and metres of the network's mean actions over all scenes and starting views."""
     starts = all_starts(lookup)
 

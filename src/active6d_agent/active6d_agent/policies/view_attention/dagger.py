@@ -18,7 +18,7 @@ import torch
 from torch.optim.lr_scheduler import CosineAnnealingLR
 from torch.optim.swa_utils import AveragedModel
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.scene_lookup import FusedBatch, SceneLookup
 from active6d_agent.environment.rollout import MEASURES, Choose, measure, roll_out
 from active6d_agent.evaluation.oracle import known
 from active6d_agent.evaluation.policy_evaluation import all_starts, run_named
@@ -142,8 +142,8 @@ class Example:
 
 
 def train_dagger(
-    train: BatchedFusion,
-    validation: BatchedFusion,
+    train: SceneLookup,
+    validation: SceneLookup,
     folder: Path,
     parameters: DaggerParameters | None = None,
     weighing: Weighing | None = None,
@@ -193,7 +193,7 @@ def train_dagger(
     settle(folder / "best.safetensors", validation, starts, parameters.steps)
 
 
-def settle(path: Path, validation: BatchedFusion, starts: np.ndarray, steps: int) -> None:
+def settle(path: Path, validation: SceneLookup, starts: np.ndarray, steps: int) -> None:
     """Give stored weights the weighing of :func:`choose_weighing`; for its arguments see there."""
     network = load_network(path, validation.model.name)
     provenance = json.loads(path.with_suffix(".json").read_text())["provenance"]
@@ -202,7 +202,7 @@ def settle(path: Path, validation: BatchedFusion, starts: np.ndarray, steps: int
     save_network(network, path, validation.model.name, {**provenance, "settled": settled})
 
 
-def choose_weighing(network: ViewAttention, validation: BatchedFusion, starts: np.ndarray, steps: int) -> Weighing:
+def choose_weighing(network: ViewAttention, validation: SceneLookup, starts: np.ndarray, steps: int) -> Weighing:
     """The lookahead with the highest detection rate on the validation scenes, then likewise the weight of metres.
 
     Weights of metres count only if the network travels no farther than the random policy.
@@ -227,9 +227,7 @@ def choose_weighing(network: ViewAttention, validation: BatchedFusion, starts: n
     return weighing
 
 
-def validate(
-    network: ViewAttention, lookup: BatchedFusion, starts: np.ndarray, steps: int
-) -> tuple[float, float, float]:
+def validate(network: ViewAttention, lookup: SceneLookup, starts: np.ndarray, steps: int) -> tuple[float, float, float]:
     """Detection rate, ADD (mm) and metres of the network's moves from (E, 2) starts."""
     moves = np.full(len(starts), steps)
     views = roll_out(lookup, greedy(network, lookup.model), starts[:, 0], starts[:, 1], moves)
@@ -266,7 +264,7 @@ def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
 
 
 def candidate_gains(
-    lookup: BatchedFusion, scene: int, views: np.ndarray, left: int, clusters: np.ndarray
+    lookup: SceneLookup, scene: int, views: np.ndarray, left: int, clusters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The gain of each view after the (v,) views taken, and that of :func:`spread` in the moves left after it.
 
@@ -283,9 +281,9 @@ def candidate_gains(
     after, ended = (
         known(lookup, np.full(len(free), scene), each) for each in (paths, spread(lookup.sphere, paths, left - 1))
     )
-    rows = lookup.fuse(np.array([scene]), views[None], views[-1:]).objects[0]
-    column, stands_for = stand_for(lookup, scene, rows, clusters)
-    count = min(len(rows), MAX_OBJECTS) + len(clusters)
+    fused = lookup.fuse(np.array([scene]), views[None], views[-1:])
+    column, stands_for = stand_for(lookup, scene, fused, clusters)
+    count = min(fused.objects.shape[1], MAX_OBJECTS) + len(clusters)
     gains = np.full((2, len(lookup.sphere), count + 1, GAINS), np.nan)
     gains[:, free] = 0.0
     for part, added in zip(gains, (after - before, ended - after), strict=True):
@@ -295,14 +293,15 @@ def candidate_gains(
 
 
 def stand_for(
-    lookup: BatchedFusion, scene: int, rows: np.ndarray, clusters: np.ndarray
+    lookup: SceneLookup, scene: int, fused: FusedBatch, clusters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Items that stand for true objects, and those objects.
 
-    An accumulated object, given by its hypothesis in ``rows``, stands for the true object that it is nearest to in
-    ADD. A cluster of unexplained surface stands for the nearest true object without an accumulated one.
+    An accumulated object of ``fused``, of one episode, stands for the true object that it is nearest to in ADD. A
+    cluster of unexplained surface stands for the nearest true object without an accumulated one.
     """
-    order = np.argsort(-lookup.verification[rows], kind="stable")
+    rows = fused.objects[0]
+    order = np.argsort(-lookup.verification[fused.best[0]], kind="stable")
     stands_for, best = np.unique(lookup.nearest_object[rows], return_index=True)
     column = np.argsort(order)[best]
     given = column < MAX_OBJECTS
@@ -322,7 +321,7 @@ def stand_for(
 class _Learner:
     """The network, its optimiser and the labelled states."""
 
-    def __init__(self, lookup: BatchedFusion, parameters: DaggerParameters, weighing: Weighing) -> None:
+    def __init__(self, lookup: SceneLookup, parameters: DaggerParameters, weighing: Weighing) -> None:
         torch.manual_seed(parameters.seed)
         self.lookup, self.parameters, self._weighing = lookup, parameters, weighing
         self._trained = ViewAttention(parameters.hidden)
