@@ -147,7 +147,7 @@ def poison_table(data):
     ("damage", "message"),
     [
         (damage_header, "format 99"),
-        (old_format, r"format 1, this version reads 2\); make it again with 'active6d bank'"),
+        (old_format, r"format 1, this version reads 3\); make it again with 'active6d bank'"),
         (cut_table, "table"),
         (poison_table, "finite"),
         (cut_surface, "surface has shape"),

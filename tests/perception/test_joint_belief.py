@@ -311,7 +311,7 @@ def test_objects_with_and_without_rotations_are_learned_together():
     alone = replace(
         alone, rotations=alone.rotations[kept], bodies=alone.bodies[kept], place=number, right=alone.right[kept]
     )
-    rotation, body = fit_belief([mixed, alone])
+    rotation, body = fit_belief([mixed, alone, *(places(rng, 300) for _ in range(2))])
     unseen = places(rng, 200)
     probability = posterior(rotation(unseen.rotations) + body(unseen.bodies)[:, None], unseen.place)
     chosen = probability.reshape(200, 6).argmax(axis=1)
