@@ -1,6 +1,6 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo results check test battery lint clean
+.PHONY: help setup transforms demo results check test battery lint clean
 
 BIN := .venv/bin
 DEMO := bags/demo
@@ -11,6 +11,9 @@ help:  ## this list
 
 setup:  ## make .venv ready (done by the others, too)
 	@scripts/setup.sh
+
+transforms: setup  ## messages of /tf for a .venv from PyPI: compiles tf2_msgs once
+	@scripts/make_transforms.sh
 
 demo: setup  ## one episode on a heap of cups: a bag and a report in bags/demo
 	rm -rf $(DEMO)

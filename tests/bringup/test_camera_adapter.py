@@ -1,5 +1,7 @@
 """The adapter against a simulated driver with each trait that real ones have."""
 
+import sys
+
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -230,8 +232,10 @@ def test_a_new_episode_begins_on_request(graph):
     graph.spin_until(lambda: len(cell.starts) == 2)
 
 
-def test_without_a_pose_topic_tf_is_needed(graph):
+def test_without_a_pose_topic_tf_is_needed(graph, monkeypatch):
+    for package in ("tf2_ros", "tf2_msgs"):
+        monkeypatch.setitem(sys.modules, package, None)
     node = CameraAdapterNode(context=graph.context, overrides=TOPICS)
     graph.add(node, start=False)
-    with pytest.raises(ValueError, match="poses from /tf need tf2_ros"):
+    with pytest.raises(ValueError, match="poses from /tf need tf2_msgs"):
         node.start()

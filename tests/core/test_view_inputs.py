@@ -128,8 +128,9 @@ def test_a_bad_transform_is_refused_and_the_node_lives(graph, buffers):
 
 
 def test_without_tf2_the_parameter_is_refused(graph, monkeypatch):
-    monkeypatch.setitem(sys.modules, "tf2_ros", None)
-    with pytest.raises(ValueError, match="viewer: poses from /tf need tf2_ros, which is not installed"):
+    for package in ("tf2_ros", "tf2_msgs"):
+        monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ValueError, match="viewer: poses from /tf need tf2_msgs, which is not installed"):
         Viewer(context=graph.context, overrides={"pose_source": "tf"})
 
 

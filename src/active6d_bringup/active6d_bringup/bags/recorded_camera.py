@@ -12,13 +12,13 @@ import numpy as np
 
 from active6d_bringup.bags.camera_topics import INFO, TRANSFORMS, CameraOptions, CameraTopics, find_camera
 from active6d_bringup.bags.source import BagError, BagSource, open_source
-from active6d_bringup.bags.transforms import TransformTree
 from active6d_bringup.bags.writer import TYPESTORE
 from active6d_bringup.camera.stream import SECOND, ArrivalGate, GateLimits, PoseHistory, Verdict, pose_difference
 from active6d_bringup.camera.view_maker import ViewMaker
 from active6d_core.camera import View
 from active6d_core.ros.conversions import MessageError, pose_to_transform
 from active6d_core.ros.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_INFO, CAMERA_POSE
+from active6d_core.ros.transform_tree import TransformTree
 from active6d_core.se3 import quaternion_from_transform
 
 #: Colour and depth further apart than this are not of one view; poses may be twice as far.

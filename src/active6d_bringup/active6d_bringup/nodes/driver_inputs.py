@@ -23,7 +23,7 @@ _INPUTS = {
     ),
     "info": (_INFO, "/camera/camera/color/camera_info", "camera_info of the colour images"),
     "depth_info": (_INFO, "", "camera_info of depth that is not registered to colour; empty: it is registered"),
-    "pose": (_POSES, "", "camera poses in the world frame; empty: from /tf (needs tf2_ros)"),
+    "pose": (_POSES, "", "camera poses in the world frame; empty: from /tf (needs tf2_msgs)"),
 }
 _LOOK_SECONDS = 0.2
 

@@ -75,7 +75,7 @@ class ViewInputs:
         node.declare(
             "pose_source",
             "topic",
-            "topic: the camera's pose comes from camera/pose; tf: from /tf (needs tf2_ros)",
+            "topic: the camera's pose comes from camera/pose; tf: from /tf (needs tf2_msgs)",
             choices=("topic", "tf"),
             fixed=True,
         )

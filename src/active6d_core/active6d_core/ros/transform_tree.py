@@ -1,0 +1,105 @@
+"""Transforms of /tf and /tf_static, live or recorded, looked up at the stamps of images."""
+
+from bisect import bisect_left
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from active6d_core.ros.conversions import MessageError, stamp_to_ns
+from active6d_core.se3 import invert, make_transform, transform_from_quaternion
+
+_LARGEST_TREE = 1000
+
+
+class TransformTree:
+    """The frames that transforms connect; each has one parent."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, str] = {}
+        self._stamps: dict[str, list[int]] = defaultdict(list)
+        self._transforms: dict[str, list[np.ndarray]] = defaultdict(list)
+        self._static: set[str] = set()
+
+    def add(self, message: Any, static: bool) -> None:
+        """Take a TFMessage of ``/tf``, or of ``/tf_static``."""
+        for each in message.transforms:
+            child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
+            t, q = each.transform.translation, each.transform.rotation
+            numbers = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], float)
+            if not np.isfinite(numbers).all() or abs(np.linalg.norm(numbers[3:]) - 1.0) > 1e-2:
+                raise MessageError(f"the transform from {parent} to {child} is not rigid")
+            self._parents[child] = parent
+            if static:
+                self._static.add(child)
+            position = bisect_left(self._stamps[child], stamp := stamp_to_ns(each.header.stamp))
+            self._stamps[child].insert(position, stamp)
+            self._transforms[child].insert(position, transform_from_quaternion(numbers[3:], numbers[:3]))
+
+    def root(self, frame: str) -> str:
+        """The frame at the root of a frame's tree."""
+        return self._chain(frame)[-1]
+
+    def has(self, frame: str) -> bool:
+        """Whether a transform names the frame."""
+        return frame in self._parents or frame in self._parents.values()
+
+    def lookup(self, target: str, source: str, stamp: int, tolerance: int | None) -> np.ndarray:
+        """(4, 4) ``T_target_source`` at a stamp (ns).
+
+        Args:
+            target: frame.
+            source: frame.
+            stamp: nanoseconds.
+            tolerance: how far (ns) the nearest transforms, which are taken, may be away; None to interpolate between
+                the transforms before and after the stamp instead.
+
+        Raises:
+            MessageError: the frames are not connected, or there is no such transform.
+        """
+        up, other = self._chain(source.lstrip("/")), self._chain(target.lstrip("/"))
+        shared = next((frame for frame in up if frame in other), None)
+        if shared is None:
+            raise MessageError(f"no transform from {target} to {source}")
+        T_shared_source = self._compose(up[: up.index(shared)], stamp, tolerance)
+        T_shared_target = self._compose(other[: other.index(shared)], stamp, tolerance)
+        return invert(T_shared_target) @ T_shared_source
+
+    def _chain(self, frame: str) -> list[str]:
+        chain = [frame.lstrip("/")]
+        while chain[-1] in self._parents and len(chain) < _LARGEST_TREE:
+            chain.append(self._parents[chain[-1]])
+        return chain
+
+    def forget_before(self, stamp: int) -> None:
+        """Forget the transforms before a stamp (ns), but for the last ones of each frame and the static ones."""
+        for child, stamps in self._stamps.items():
+            first = min(bisect_left(stamps, stamp), len(stamps) - 1)
+            if child not in self._static and first > 0:
+                del stamps[:first], self._transforms[child][:first]
+
+    def forget_moving(self) -> None:
+        """Forget all transforms but the static ones."""
+        for child in set(self._stamps) - self._static:
+            del self._stamps[child], self._transforms[child], self._parents[child]
+
+    def _compose(self, chain: list[str], stamp: int, tolerance: int | None) -> np.ndarray:
+        T = np.eye(4)
+        for child in chain:
+            T = self._at(child, stamp, tolerance) @ T
+        return T
+
+    def _at(self, child: str, stamp: int, tolerance: int | None) -> np.ndarray:
+        stamps, transforms = self._stamps[child], self._transforms[child]
+        nearest = min(range(len(stamps)), key=lambda index: abs(stamps[index] - stamp))
+        late, after = abs(stamps[nearest] - stamp), bisect_left(stamps, stamp)
+        if child in self._static or late <= (tolerance or 0):
+            return transforms[nearest]
+        if tolerance is not None or after in (0, len(stamps)):
+            raise MessageError(f"the nearest transform of {child} is {late * 1e-6:.0f} ms from the image")
+        share = (stamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+        a, b = transforms[after - 1], transforms[after]
+        turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
+        R = a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+        return make_transform(R, (1 - share) * a[:3, 3] + share * b[:3, 3])
