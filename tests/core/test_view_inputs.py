@@ -251,6 +251,17 @@ def test_a_late_announcement_ends_only_what_came_before_its_view(follower):
     assert follower.views == [2 * SECOND, 3 * SECOND]
 
 
+def test_a_late_announcement_keeps_a_view_that_has_begun_since(follower):
+    """So a restarted node gets latched messages: each topic in order, the topics in any order."""
+    follower.info(SECOND // 2)
+    follower.view(SECOND)
+    follower.info(2 * SECOND)
+    follower.announce(SECOND)
+    follower.pose(2 * SECOND)
+    follower.pose(SECOND // 2)
+    assert follower.views == [SECOND, 2 * SECOND]
+
+
 def test_an_announcement_of_a_view_of_an_earlier_episode_changes_nothing(follower):
     for stamp in (SECOND, 2 * SECOND):
         follower.view(stamp)

@@ -36,6 +36,8 @@ class StampSynchronizer:
         self._depth = depth
         self._pending: dict[int, dict[str, Any]] = {}
         self._over: dict[int, str] = {}
+        self._begun = 0
+        self._place: dict[int, int] = {}
 
     def add(self, name: str, stamp: int, value: Any) -> None:
         """Take a value; a second one for an incomplete stamp replaces the first (its sender was restarted).
@@ -47,7 +49,11 @@ class StampSynchronizer:
         """
         if stamp in self._over:
             raise OutdatedError(f"{self._over[stamp]} {stamp * 1e-9:.3f} s of {name}")
-        self._pending.setdefault(stamp, {})[name] = value
+        if stamp not in self._pending:
+            self._pending[stamp] = {}
+            self._begun += 1
+            self._place[stamp] = self._begun
+        self._pending[stamp][name] = value
         if self._pending[stamp].keys() == self._names:
             values = self._pending.pop(stamp)
             self._close(stamp, "duplicate stamp")
@@ -57,6 +63,7 @@ class StampSynchronizer:
         elif len(self._pending) > self._depth:
             # A stamp that has lost its place may come again from another sender: it is not over.
             oldest = next(iter(self._pending))
+            del self._place[oldest]
             self._on_loss(oldest, sorted(self._names - self._pending.pop(oldest).keys()))
 
     def over(self, stamp: int) -> bool:
@@ -65,9 +72,8 @@ class StampSynchronizer:
 
     def end_before(self, stamp: int) -> None:
         """End the incomplete sets that began before the one of ``stamp``; all of them if that one has not begun."""
-        for other in list(self._pending):
-            if other == stamp:
-                break
+        place = self._place.get(stamp, self._begun + 1)
+        for other in [each for each in self._pending if self._place[each] < place]:
             del self._pending[other]
             self._close(other, "older than the episode, stamp")
 
@@ -83,4 +89,5 @@ class StampSynchronizer:
     def _close(self, stamp: int, reason: str) -> None:
         self._over[stamp] = reason
         if len(self._over) > _REMEMBERED:
-            del self._over[next(iter(self._over))]
+            oldest = next(iter(self._over))
+            del self._over[oldest], self._place[oldest]
