@@ -206,6 +206,18 @@ def test_the_export_is_the_trained_policy(lookup):
     torch.testing.assert_close(again[1], log_prob)
 
 
+def test_an_interrupted_training_goes_on_between_evaluations(lookup, tmp_path, monkeypatch):
+    settings = {"environments": 8, "rollout": 5, "batch": 20, "evaluate_every": 40, "seed": 3}
+    monkeypatch.setattr("active6d_core.files.Checkpoints.due", lambda self: True)
+    parameters = PpoParameters(total=120, **settings)
+    monkeypatch.setattr("active6d_agent.policies.attention.ppo.validate", lambda *_: (0.5, 1.0, 1.0))
+    assert next(train_ppo(lookup, lookup, tmp_path, parameters)).steps == 40
+    state = json.loads((tmp_path / "latest.json").read_text())
+    # As an interruption in the middle of the second part leaves it.
+    (tmp_path / "latest.json").write_text(json.dumps({**state, "steps": 56}))
+    assert [p.steps for p in train_ppo(lookup, lookup, tmp_path, parameters, resume=True)] == [96, 136]
+
+
 def test_training_is_its_seed_learns_and_resumes(lookup, tmp_path):
     settings = {"environments": 8, "rollout": 5, "batch": 20, "evaluate_every": 40, "seed": 3}
     curves = []

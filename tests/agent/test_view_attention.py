@@ -482,6 +482,28 @@ def test_training_and_deployment_move_alike(lookup, network, policy):
 
 
 @pytest.mark.slow
+def test_an_interrupted_training_goes_on_between_evaluations(tmp_path, monkeypatch):
+    lookup = BatchedFusion(synthetic_bank("mug", scenes=2, objects=3))
+    settings = {"episodes": 2, "updates": 2, "longest": 2, "steps": 2, "starts": 4, "batch": 8}
+    parameters = dagger.DaggerParameters(rounds=3, evaluate_every=3, **settings)
+    monkeypatch.setattr("active6d_core.files.Checkpoints.due", lambda self: True)
+    rounds = []
+    advance = dagger._Learner.advance
+
+    def counted(learner):
+        if learner.round == 2 and 2 not in rounds:
+            rounds.append(2)
+            raise KeyboardInterrupt
+        rounds.append(learner.round)
+        return advance(learner)
+
+    monkeypatch.setattr(dagger._Learner, "advance", counted)
+    with pytest.raises(KeyboardInterrupt):
+        next(dagger.train_dagger(lookup, lookup, tmp_path, parameters))
+    assert [p.round for p in dagger.train_dagger(lookup, lookup, tmp_path, parameters, resume=True)] == [3]
+    assert rounds == [0, 1, 2, 2]
+
+
 def test_it_learns_its_way_past_random_and_resumes(tmp_path):
     lookup = BatchedFusion(synthetic_bank("mug", scenes=3, objects=12))
     starts = all_starts(lookup, 40, 0)

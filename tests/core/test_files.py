@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from active6d_core.files import atomic_file, cache_folder, sha256_of, write_file
+from active6d_core.files import Checkpoints, atomic_file, cache_folder, sha256_of, write_file
 
 
 def test_the_cache_follows_the_xdg_variable(monkeypatch, tmp_path):
@@ -59,3 +59,13 @@ def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):
         write_file(cache_folder("banks") / "a.npz", "")
     with pytest.raises(OSError, match=r"cannot be written.*choose another folder"):
         write_file(tmp_path / "file" / "a", "")
+
+
+def test_a_checkpoint_is_due_when_its_time_has_passed(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("active6d_core.files.time.monotonic", lambda: now)
+    checkpoints = Checkpoints(20.0)
+    assert not checkpoints.due()
+    now = 121.0
+    assert checkpoints.due()
+    assert not checkpoints.due()

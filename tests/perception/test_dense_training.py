@@ -330,7 +330,7 @@ def test_training_writes_weights_and_curves(trained):
     assert not loaded.network.training
 
 
-def test_training_goes_on_where_it_stopped(tmp_path, trained, mug_view):
+def test_training_goes_on_where_it_stopped(tmp_path, trained, mug_view, monkeypatch):
     folder, _ = trained
     shards, model = [folder / "views.npz"], load_object("mug")
     steps = []
@@ -344,6 +344,12 @@ def test_training_goes_on_where_it_stopped(tmp_path, trained, mug_view):
         train(model, shards, [mug_view[0]], tmp_path, quick(), on_step=interrupt)
     train(model, shards, [mug_view[0]], tmp_path, quick(), on_step=lambda report: steps.append(report.step))
     assert steps == [1, 2, 3, 3, 4]  # the checkpoint is of step 2
+    steps.clear()
+    monkeypatch.setattr("active6d_core.files.Checkpoints.due", lambda self: True)
+    with pytest.raises(KeyboardInterrupt):
+        train(model, shards, [mug_view[0]], tmp_path / "slow", quick(), on_step=interrupt)
+    train(model, shards, [mug_view[0]], tmp_path / "slow", quick(), on_step=lambda report: steps.append(report.step))
+    assert steps == [1, 2, 3, 4]
     with pytest.raises(ValueError, match="other options"):
         train(model, shards, [mug_view[0]], tmp_path, quick(learning_rate=1e-4))
     (tmp_path / "state.safetensors").write_bytes(b"broken")

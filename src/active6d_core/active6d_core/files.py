@@ -2,10 +2,28 @@
 
 import hashlib
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+#: Long work is written to a file at least this often, so that an interruption loses less than 30 s.
+CHECKPOINT_SECONDS = 20.0
+
+
+class Checkpoints:
+    """Says when work is to be written again: when so many seconds have passed since it was last due."""
+
+    def __init__(self, seconds: float = CHECKPOINT_SECONDS) -> None:
+        self._seconds, self._last = seconds, time.monotonic()
+
+    def due(self) -> bool:
+        """Whether it is time; if so, the time starts again."""
+        if time.monotonic() - self._last < self._seconds:
+            return False
+        self._last = time.monotonic()
+        return True
 
 
 def cache_folder(name: str) -> Path:

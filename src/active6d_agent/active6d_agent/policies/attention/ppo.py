@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -32,7 +32,7 @@ from active6d_agent.policies.attention.network import (
     save_network,
 )
 from active6d_agent.policies.registry import Observation
-from active6d_core.files import atomic_file, write_file
+from active6d_core.files import Checkpoints, atomic_file, write_file
 
 
 @dataclass(frozen=True)
@@ -254,14 +254,20 @@ def train_ppo(
     ppo = _make_ppo(train, parameters, reward)
     identity = {"parameters": asdict(parameters) | {"total": 0}, "reward": asdict(reward)}
     curve, best, begun = folder / "curve.jsonl", (-1.0, 0.0), time.perf_counter()
+    evaluated = 0
     if resume:
-        best, seconds = _restore(ppo, folder, identity)
+        best, seconds, evaluated = _restore(ppo, folder, identity)
         begun -= seconds
     else:
         curve.unlink(missing_ok=True)
-    while ppo.num_timesteps < parameters.total:
-        chunk = min(parameters.evaluate_every, parameters.total - ppo.num_timesteps)
-        ppo.learn(chunk, reset_num_timesteps=False, progress_bar=False)
+
+    def keep() -> None:
+        state = {"best": best, "seconds": time.perf_counter() - begun, "evaluated": evaluated}
+        _checkpoint(ppo, folder, {**identity, **state})
+
+    while evaluated < parameters.total:
+        _learn(ppo, min(evaluated + parameters.evaluate_every, parameters.total), keep)
+        evaluated = ppo.num_timesteps
         network = cast(PaperPolicy, ppo.policy).network()
         measured = validate(network, validation, parameters.steps)
         returns = [episode["r"] for episode in ppo.ep_info_buffer or []]
@@ -272,8 +278,21 @@ def train_ppo(
         if (progress.detection_rate, -progress.e_add_mm) > best:
             best = (progress.detection_rate, -progress.e_add_mm)
             save_network(network, folder / "best.safetensors", {**identity, "validation": asdict(progress)})
-        _checkpoint(ppo, folder, {**identity, "best": best, "seconds": progress.seconds})
+        keep()
         yield progress
+
+
+def _learn(ppo: PPO, until: int, keep: Callable[[], None]) -> None:
+    """Learn until so many environment steps are done, and call ``keep`` every some seconds."""
+    checkpoints = Checkpoints()
+
+    def keep_when_due(*_: Any) -> bool:
+        if checkpoints.due():
+            keep()
+        return True
+
+    if until > ppo.num_timesteps:
+        ppo.learn(until - ppo.num_timesteps, reset_num_timesteps=False, progress_bar=False, callback=keep_when_due)
 
 
 def _make_ppo(lookup: SceneLookup, parameters: PpoParameters, reward: RewardParameters) -> PPO:
@@ -318,8 +337,8 @@ def _checkpoint(ppo: PPO, folder: Path, state: dict[str, Any]) -> None:
     write_file(folder / "latest.json", json.dumps({**state, "steps": ppo.num_timesteps}, indent=2) + "\n")
 
 
-def _restore(ppo: PPO, folder: Path, identity: dict[str, Any]) -> tuple[tuple[float, float], float]:
-    """Load a checkpoint into ``ppo``; the best so far and the seconds spent."""
+def _restore(ppo: PPO, folder: Path, identity: dict[str, Any]) -> tuple[tuple[float, float], float, int]:
+    """Load a checkpoint into ``ppo``; the best so far, the seconds spent, and the steps at the last evaluation."""
     path = folder / "latest.safetensors"
     try:
         state, tensors = json.loads(path.with_suffix(".json").read_text()), load_file(path)
@@ -337,4 +356,4 @@ def _restore(ppo: PPO, folder: Path, identity: dict[str, Any]) -> tuple[tuple[fl
     ppo.num_timesteps = int(state["steps"])
     # The seed alone would draw the same scenes again.
     ppo.set_random_seed((ppo.seed or 0) + ppo.num_timesteps)
-    return tuple(state["best"]), float(state["seconds"])
+    return tuple(state["best"]), float(state["seconds"]), int(state.get("evaluated", state["steps"]))

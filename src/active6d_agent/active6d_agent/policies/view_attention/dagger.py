@@ -32,6 +32,7 @@ from active6d_agent.policies.view_attention.network import (
     save_network,
     value_views,
 )
+from active6d_core.files import Checkpoints
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 
@@ -161,7 +162,7 @@ def train_dagger(
         folder: of the results.
         parameters: how to train.
         weighing: of gains and travel, for the learner's moves.
-        resume: go on from ``latest`` with newly collected states.
+        resume: go on from ``latest``, which is at most one round or some 20 s old, with newly collected states.
 
     Raises:
         ValueError: there is nothing to resume from.
@@ -176,15 +177,21 @@ def train_dagger(
     else:
         curve.unlink(missing_ok=True)
     starts = all_starts(validation, parameters.starts, parameters.seed)
+    common = {"parameters": asdict(parameters), "bank": train.bank.provenance}
+    checkpoints = Checkpoints()
     while learner.round < parameters.rounds:
         loss = learner.advance()
+        seconds = time.perf_counter() - begun
         if learner.round % parameters.evaluate_every and learner.round < parameters.rounds:
+            if checkpoints.due():
+                done = {"round": learner.round, "seconds": seconds, "states": learner.states}
+                save_network(learner.network, latest, train.model.name, {**common, "progress": done, "best": best})
             continue
         measured = validate(learner.network, validation, starts, parameters.steps)
-        progress = DaggerProgress(learner.round, time.perf_counter() - begun, learner.states, loss, *measured)
+        progress = DaggerProgress(learner.round, seconds, learner.states, loss, *measured)
         with curve.open("a") as file:
             file.write(json.dumps(asdict(progress)) + "\n")
-        made = {"parameters": asdict(parameters), "progress": asdict(progress), "bank": train.bank.provenance}
+        made = {**common, "progress": asdict(progress)}
         if (progress.detection_rate, -progress.e_add_mm) > best:
             best = (progress.detection_rate, -progress.e_add_mm)
             save_network(learner.network, folder / "best.safetensors", train.model.name, made)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from active6d_core.files import atomic_file, write_file
+from active6d_core.files import Checkpoints, atomic_file, write_file
 from active6d_core.object_model import ObjectModel
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import canonical_frame_of
@@ -46,7 +46,7 @@ class TrainingOptions:
         warmup: number of steps over which the learning rate rises.
         weight_decay: of AdamW.
         averaging: factor per step of the exponential moving average of the weights.
-        checkpoint_every: steps between checkpoints; an interruption loses at most so many.
+        checkpoint_every: steps between checkpoints; an interruption loses at most so many, or some 20 s.
         validate_every: steps between validations, a multiple of ``checkpoint_every``.
         workers: number of processes that prepare batches.
         seed: seed of initial weights, order and augmentation.
@@ -133,6 +133,7 @@ def train(
     )
     best = folder / "best.safetensors"
     running: list[dict[str, float]] = []
+    checkpoints = Checkpoints()
     while run.step < options.steps:
         inputs, targets = next(feed)
         terms = run.advance(inputs, targets)
@@ -149,7 +150,7 @@ def train(
                 save_network(best, replace(averaged, training=training))
             write_file(folder / "curves.json", json.dumps(run.history, indent=1) + "\n")
             draw_curves(run.history, folder / "curves.png", title=f"{model.name}: training of the dense estimator")
-        if run.step % options.checkpoint_every == 0 or run.step == options.steps:
+        if run.step % options.checkpoint_every == 0 or run.step == options.steps or checkpoints.due():
             run.save()
         on_step(Report(run.step, run.loss, terms, run.history[-1] if run.history else {}))
     return best
