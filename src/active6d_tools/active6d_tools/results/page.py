@@ -73,6 +73,7 @@ JOBS = {
         Job("attention", "ablate attention --sample 1000", trains=True),
         Job("signs", "ablate signs --sample 1000", trains=True),
         Job("seeds", "ablate seeds --sample 1000", trains=True),
+        Job("arm", "benchmark arm --episodes 20", draws=True),
         Job("environment", "benchmark environment", times=True),
         Job("pipeline", "benchmark pipeline", draws=True, times=True),
     )
@@ -175,6 +176,7 @@ BLOCKS: dict[str, Callable[[Mapping[str, Measured]], str]] = {
     "attention": _block("attention", _variants(*_PAPERS_MEASURES)),
     "signs": _block("signs", _variants(*_PAPERS_MEASURES)),
     "seeds": _block("seeds", tables.seeds_table),
+    "arm": _block("arm", tables.arm_table),
     "environment": _block("environment", tables.environment_table),
     "pipeline": _block("pipeline", tables.pipeline_table),
 }

@@ -168,6 +168,20 @@ def environment_table(reports: Reports) -> str:
     )
 
 
+def arm_table(reports: Reports) -> str:
+    """What the camera on the arm finds, and the seconds that it takes."""
+    header = ["", "policy", "found in the first view", "in the end", "seconds a move", "95 % below", "an episode"]
+    header += ["refused goals", "least clearance"]
+    rows = []
+    for name, own in reports.items():
+        for policy, row in own["policies"].items():
+            shares = (f"{row['found'][view]:.3f}" for view in (0, -1))
+            seconds = (f"{row[f'seconds_{part}']:.1f}" for part in ("per_move", "p95", "per_episode"))
+            rest = f"{row['refused']:.1f}", f"{row['least_clearance_mm']:.0f} mm"
+            rows.append([name, policy, *shares, *seconds, *rest])
+    return table(header, rows)
+
+
 def pipeline_table(reports: Reports) -> str:
     """Times of the last of six views after the estimator."""
     header = ["", "objects", "verification", "fusion", "policy", "all", "decision, 99th percentile"]
