@@ -1,5 +1,7 @@
 """Recordings of other programs: every storage, transport and naming is read, or refused with its cause."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -264,6 +266,61 @@ def test_what_cannot_be_used_is_refused_with_its_cause(tmp_path, change, words):
         read_bag(bag)
     if "unit" in change:
         assert_views(bag, CameraOptions(depth_scale=1e-4))
+
+
+def with_infos(change):
+    """The driver's messages with camera_info as another driver fills it in."""
+    messages = []
+    for arrival, topic, message in driver_messages():
+        if topic == INFO:
+            numbers = {name: getattr(message, name).copy() for name in ("d", "k", "p")}
+            numbers |= {"width": message.width, "height": message.height, "roi": message.roi}
+            change(numbers)
+            message = replace(message, **numbers)
+        messages.append((arrival, topic, message))
+    return messages
+
+
+def k_is_the_identity(numbers):
+    numbers["k"][:] = np.eye(3).ravel()
+
+
+def k_is_that_of_the_raw_image(numbers):
+    numbers["k"][[0, 2, 4]] += [20.0, 3.0, 20.0]
+
+
+def a_region_of_a_larger_image(numbers):
+    numbers["k"][[2, 5]] += [40, 30]
+    numbers["p"][[2, 6]] += [40, 30]
+    numbers |= {"width": 160, "height": 120, "roi": TYPES["sensor_msgs/msg/RegionOfInterest"](40, 30, 60, 80, False)}
+
+
+@pytest.mark.parametrize("change", [k_is_the_identity, k_is_that_of_the_raw_image, a_region_of_a_larger_image])
+def test_intrinsics_are_those_of_the_images_however_drivers_write_them(tmp_path, change):
+    assert_views(write(tmp_path / "bag", with_infos(change)))
+
+
+def test_distortion_that_was_left_in_camera_info_is_said_and_can_be_switched_off(tmp_path):
+    def distort(numbers):
+        numbers["d"][:2] = -0.2, 0.05
+
+    bag = write(tmp_path / "bag", with_infos(distort))
+    assert any("if they are already, say so" in note for note in read_bag(bag).notes)
+    assert not assert_views(bag, CameraOptions(rectified=True)).notes
+
+
+def test_floating_point_millimetres_are_recognised(tmp_path):
+    messages = []
+    for arrival, topic, message in driver_messages():
+        if topic == DEPTH:
+            stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+            steps = message.data.view(np.uint16).reshape(60, 80).astype(np.float32)
+            message = image(steps, "32FC1", stamp)
+        messages.append((arrival, topic, message))
+    bag = write(tmp_path / "bag", messages)
+    with pytest.raises(BagError, match=r"depth looks like millimetres .*set depth_scale to 0.001"):
+        read_bag(bag)
+    assert_views(bag, CameraOptions(depth_scale=1e-3))
 
 
 def test_a_bag_without_depth_names_what_it_holds(tmp_path):
