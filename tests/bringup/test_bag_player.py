@@ -8,6 +8,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from stub_episode import StubEpisode
 
+from active6d_bringup.bags.replay import _Listener
 from active6d_bringup.bags.writer import EpisodeWriter
 from active6d_bringup.nodes.bag_player import BagPlayerNode
 from active6d_core.ros.conversions import (
@@ -90,8 +91,21 @@ def test_it_publishes_the_stamps_of_its_views_as_the_clock_and_does_not_wait_for
 
 def test_with_use_sim_time_it_keeps_to_the_clock_of_others(graph, player):
     poses, _ = player(now=100 * SECOND, use_sim_time=True, rate=1.0)
+    assert graph._nodes[-1].awaited() is None
     graph.publish("/clock", Clock(clock=ns_to_stamp((100 + PAUSE - 1) * SECOND)))
     graph.spin_for(0.3)
     assert len(poses) == 1
     graph.publish("/clock", Clock(clock=ns_to_stamp((100 + PAUSE + 1) * SECOND)))
     graph.spin_until_filled([poses], count=2)
+
+
+def test_it_says_that_it_waits_for_the_clock(graph, player, monkeypatch):
+    monkeypatch.setattr("active6d_core.ros.heartbeat.CAUSE_AFTER_SECONDS", 0.0)
+    events = []
+    listener = graph.add(_Listener(graph.context, events.append))
+    poses, _ = player(use_sim_time=True, rate=1.0)
+    graph.spin_until(lambda: listener.causes, timeout=20, what="the cause")
+    text = "use_sim_time needs a publisher of /clock; start one, or set use_sim_time to false"
+    assert len(poses) == 1
+    assert events[0].startswith("bag_player is waiting for /clock for ")
+    assert events[0].endswith(text)

@@ -192,8 +192,10 @@ def test_rosbags_and_mcap_read_every_message(bags):
     assert decoded == counted
 
 
-def test_replay_through_live_perception_is_equal(bags):
-    result = replay(ReplaySettings(bags[0], domain=fresh_domain()))
+def test_replay_through_live_perception_is_equal_and_names_other_nodes(bags, graph):
+    events = []
+    result = replay(ReplaySettings(bags[0], domain=graph.domain), on_event=events.append)
+    assert f"also in ROS domain {graph.domain}: /tester" in events
     assert result.equal, result.largest_differences()
     assert result.views == MOVES + 1
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.context import Context
 from rclpy.node import Node
 
@@ -22,9 +23,9 @@ from active6d_bringup.graph.composition import (
     running,
 )
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
-from active6d_core.ros.conversions import read_table
+from active6d_core.ros.conversions import own_statuses, read_table, status_values
 from active6d_core.ros.node import qos_of
-from active6d_core.ros.topics import PERCEPTION_TOPICS, Topic
+from active6d_core.ros.topics import DIAGNOSTICS, PERCEPTION_TOPICS, Topic
 
 #: What perception makes of a view, by topic name.
 COMPARED = {topic.name: topic for topic in PERCEPTION_TOPICS}
@@ -140,10 +141,11 @@ def replay(
     stamps = [step.stamp for episode in episodes for step in episode.steps]
     description = describe(settings, episodes[0].object, index.settings, index.frames)
     with interruptible() as interrupted, running(make_graph(settings, description, on_event, interrupted)) as graph:
-        listener = _Listener(graph.context)
+        listener = _Listener(graph.context, on_event)
         graph.add(listener)
         started = time.monotonic()
         graph.start()
+        description.name_others(listener, on_event)
         answered, deadline = -1, 0.0
         while len(listener.answered(stamps)) < len(stamps):
             if interrupted.is_set():
@@ -152,7 +154,8 @@ def replay(
                 answered, deadline = len(listener.answered(stamps)), time.monotonic() + settings.patience
                 on_view(answered, len(stamps))
             elif time.monotonic() > deadline:
-                raise EpisodeError(f"no objects of view {answered + 1} of {len(stamps)} in {settings.patience:.0f} s")
+                silent = f"no objects of view {answered + 1} of {len(stamps)} in {settings.patience:.0f} s"
+                raise EpisodeError("; ".join([silent, *listener.causes.values()]))
             graph.spin_once(0.1)
         seconds = time.monotonic() - started
         on_view(len(stamps), len(stamps))
@@ -226,17 +229,30 @@ def _differences(expected: Any, found: Any) -> dict[str, float]:
 
 
 class _Listener(Node):
-    """Keeps what perception says, serialized."""
+    """Keeps what perception says, serialized, and which nodes wait in vain; the latter are reported once."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, on_event: OnEvent) -> None:
         super().__init__("replay_listener", context=context, start_parameter_services=False, enable_rosout=False)
+        self._on_event, self._reported = on_event, set[str]()
         self.payloads: dict[tuple[str, int], bytes] = {}
+        self.causes: dict[str, str] = {}
+        self.create_subscription(DIAGNOSTICS.message_type, DIAGNOSTICS.name, self._on_diagnostics, DIAGNOSTICS.depth)
         for topic in PERCEPTION_TOPICS:
 
             def keep(payload: bytes, topic: Topic = topic) -> None:
                 self.payloads[topic.name, stamp_of(topic.type, payload)] = payload
 
             self.create_subscription(topic.message_type, topic.name, keep, qos_of(topic, 100), raw=True)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in own_statuses(message):
+            if "state" in status_values(status):
+                self.causes.pop(status.name, None)
+                if status.level == DiagnosticStatus.WARN:
+                    self.causes[status.name] = text = f"{status.name.rpartition('/')[2]} is {status.message}"
+                    if status.name not in self._reported:
+                        self._reported.add(status.name)
+                        self._on_event(text)
 
     def answered(self, stamps: list[int]) -> list[int]:
         """The views for which everything that is compared has arrived."""

@@ -74,12 +74,13 @@ class GraphDescription:
     def _claim(self) -> DomainClaim:
         return DomainClaim(self.domain if self.domain is not None else domain_of(), self.namespace)
 
-    def foreign_nodes(self, node: Node) -> list[str]:
-        """Full names of other nodes in a domain that the user named, as ``node`` of this graph has discovered them."""
+    def name_others(self, node: Node, on_event: OnEvent) -> None:
+        """Report other nodes in a domain that the user named, as ``node`` of this graph has discovered them."""
         if self.domain is None and domain_of() is None:
-            return []
+            return
         space = f"/{self.namespace.strip('/')}/" if self.namespace else "/"
-        return others_in_domain(node, [space + name for name in (*self.nodes, "supervisor")])
+        if others := others_in_domain(node, [space + name for name in (*self.nodes, "supervisor")]):
+            on_event(f"also in ROS domain {self.domain_id()}: {', '.join(others)}")
 
     def release_domain(self) -> None:
         """Let others have the domain."""

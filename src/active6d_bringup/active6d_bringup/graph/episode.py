@@ -196,8 +196,7 @@ def run_episode(
         monitor = EpisodeMonitor(graph.context, settings.namespace, on_step)
         graph.add(monitor)
         graph.start()
-        if others := description.foreign_nodes(monitor):
-            note(f"also in ROS domain {description.domain_id()}: {', '.join(others)}")
+        description.name_others(monitor, note)
         _spin_to_end(graph, monitor, settings.patience, interrupted, note)
         return monitor.result(settings, events)
 

@@ -68,10 +68,18 @@ class BagPlayerNode(GraphNode):
         self._publish_next()
 
     def awaited(self) -> Awaited | None:
-        """The objects of the last view, unless views follow by time."""
+        """The objects of the last view; if views follow by time and nobody sets that time, the clock."""
+        if self._rate > 0 and self._waits_for_clock():
+            return Awaited((topics.CLOCK.name,))
         if self._rate > 0 or self._next > len(self._stamps):
             return None
         return Awaited(("objects",), self._stamps[self._next - 1])
+
+    def _waits_for_clock(self) -> bool:
+        """Whether the next view waits for a time that stands still: with use_sim_time and without /clock."""
+        if self._timer is None or self.value("publish_clock"):
+            return False
+        return self.get_clock().ros_time_is_active and not self.count_publishers(topics.CLOCK.name)
 
     def teardown(self) -> None:
         """Stop playing."""

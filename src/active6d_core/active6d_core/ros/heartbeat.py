@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind
 
+from active6d_core.ros.topics import CLOCK
+
 #: A node that waits longer than this looks for a cause.
 CAUSE_AFTER_SECONDS = 5.0
 
@@ -62,6 +64,8 @@ class Watch:
         """Why what is awaited does not come, as far as the node can know; empty when it cannot or need not."""
         if self._awaited is None or self._clock() - self._since < CAUSE_AFTER_SECONDS:
             return ""
+        if CLOCK.name in self._awaited.topics:
+            return f"use_sim_time needs a publisher of {CLOCK.name}; start one, or set use_sim_time to false"
         silent = [topic for topic in self._awaited.topics if not self._node.count_publishers(topic)]
         if silent:
             where = self._node.get_namespace()
