@@ -26,6 +26,7 @@ setup(
         "matplotlib",
         "numpy",
         "open3d-cpu",
+        "opencv-contrib-python-headless",
         "pillow",
         "pyyaml",
         "rich",
