@@ -11,7 +11,7 @@ from active6d_agent.environment.gym_environment import Active6DEnv
 from active6d_agent.evaluation import oracle
 from active6d_agent.evaluation import policy_evaluation as evaluation
 from active6d_agent.policies.registry import Decision, create_policy
-from active6d_core.metrics import evaluate_scene
+from active6d_core.metrics import DETECTION_FRACTION, e_add, evaluate_scene
 
 
 @pytest.fixture(scope="module")
@@ -194,3 +194,16 @@ def test_differences_are_resampled_by_scene_start_by_start(lookup, starts):
         np.testing.assert_allclose(told["ci95_scenes"], by_scene)
         assert told["excludes_zero_scenes"] == (np.sign(by_scene).sum() != 0)
         assert told["mean"] == pytest.approx(differences.mean())
+
+
+def test_confirmed_objects_are_counted_by_hand(lookup, starts):
+    results = evaluation.run_named(lookup, "random", starts, 3)
+    limit = DETECTION_FRACTION * lookup.model.diameter
+    for index, (scene, _) in enumerate(starts):
+        objects = lookup.objects(scene, results.views[index])
+        sure = objects.T_world_object[objects.probability >= lookup.parameters.confirmed]
+        true = lookup.bank.scenes[scene].T_world_object
+        assert results.confirmed_rate[index] == pytest.approx(evaluate_scene(lookup.model, sure, true).detection_rate)
+        right = (e_add(lookup.model, sure[:, None], true) < limit).any(axis=1)
+        assert results.wrong[index] == pytest.approx(1 - right.mean() if len(right) else 0.0)
+    assert 0 < results.wrong.mean() < 1

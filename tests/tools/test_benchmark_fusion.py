@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 from hand_made_scenes import make_scene, three_mugs
 
+from active6d_core.camera import DEFAULT_CAMERA
+from active6d_core.hypotheses import Hypotheses
+from active6d_core.se3 import invert, rotation_angle, transform_points
+from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.belief_weights import BeliefWeights
 from active6d_perception.scene.fusion import FusionParameters
+from active6d_perception.scene.measured_view import MeasuredView
 from active6d_tools.benchmark.fusion_methods import MethodResults, compare_methods
+from active6d_tools.processed_scene import PoseError, ProcessedView
 
 
 def test_only_confirmed_objects_count_and_wrong_ones_are_told():
@@ -39,3 +45,26 @@ def test_methods_fuse_the_same_views(tmp_path, monkeypatch):
         assert row["reported"] >= 3
         assert row["ms"] > 0
     assert results["ring"]["best-view"]["found"] >= 2 / 3
+
+
+def test_a_wrong_camera_moves_what_is_in_the_world_and_nothing_in_its_frame():
+    rng, T = np.random.default_rng(0), ViewSphere().pose(ViewSphere().positions[7])
+    middles = np.array([[0.0, 0.0, 0.05], [0.1, 0.0, 0.03]])
+    depth, normals, instance = np.ones((2, 2), np.float32), np.zeros((2, 2, 3), np.int8), np.zeros((2, 2), np.int16)
+    measured = MeasuredView(depth, normals, instance, middles, invert(T), 2.0, 2.0, 0.5, 0.5)
+    view = ProcessedView(1, T, DEFAULT_CAMERA, Hypotheses.empty(2, 2), np.zeros(0), measured)
+    assert PoseError().disturb(view, rng) is view
+    shifts, angles = [], []
+    for _ in range(300):
+        wrong = PoseError(5.0, 0.5).disturb(view, rng)
+        off = invert(T) @ wrong.T_world_camera
+        shifts.append(off[:3, 3])
+        angles.append(rotation_angle(np.eye(3), off[:3, :3]))
+        np.testing.assert_allclose(wrong.measured.T_camera_world, invert(wrong.T_world_camera), atol=1e-12)
+        own, theirs = (
+            transform_points(invert(T), middles),
+            transform_points(wrong.measured.T_camera_world, wrong.measured.middles),
+        )
+        np.testing.assert_allclose(own, theirs, atol=1e-12)
+    assert np.sqrt((np.array(shifts) ** 2).sum(axis=1).mean()) == pytest.approx(0.005, rel=0.1)
+    assert np.degrees(np.sqrt((np.array(angles) ** 2).mean())) == pytest.approx(0.5, rel=0.1)

@@ -294,7 +294,7 @@ def test_missing_seeds_are_trained(banks, tmp_path, monkeypatch):
         (["bank", "--split", "holdout"], "--split 'holdout'"),
         (["bank", "--estimator", "psychic"], "unknown estimator 'psychic'"),
         (["bank", "--object", "teapot"], "unknown object 'teapot'"),
-        (["bank", "--heaps", "3"], "--heaps adds to the scenes of train and val"),
+        (["bank", "--split", "wild_test", "--heaps", "3"], "--heaps adds to the scenes of train, val, test"),
     ],
 )
 def test_bad_input_is_one_clear_line(banks, arguments, words):

@@ -69,6 +69,7 @@ def test_weights_are_fitted_to_scenes(scene_folder, monkeypatch):
     assert names == ["mug/train/0", "mug/val/0", "mug/wild_val/0"]
     assert measured["places"] >= 3
     assert weights.provenance["objects"] == ["mug"]
+    assert (weights.provenance["belief_scenes"], weights.provenance["probability_scenes"]) == (1, 2)
     episodes = fusion_training._episodes("mug/val/0", weights, 1, "auto", 7)
     fusion, last, T_true = next(episodes)
     assert isinstance(fusion, JointFusion)

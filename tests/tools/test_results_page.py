@@ -64,10 +64,18 @@ def test_table_1_shows_the_papers_numbers_beside_ours(evaluated):
     own = evaluated["policies"]["random"]
     low, high = own["detection_rate_ci95_scenes"]
     assert rows["`random`"][2] == f"{own['detection_rate']:.3f} ({low:.3f} to {high:.3f})".replace("0.", ".")
-    assert rows["`random`"][3:] == ["0 %", "4.97 m, 13.48 mm, 0.76"]
-    assert rows["`view-attention`"][3:] == ["50 %", ""]
+    assert rows["`random`"][3:] == ["", "", "0 %", "4.97 m, 13.48 mm, 0.76"]
+    assert rows["`view-attention`"][3:] == ["", "", "50 %", ""]
     for others in ({**evaluated, "object": "mug"}, {**evaluated, "steps": 10}):
-        assert len(rows_of(tables.policies_table(others))["`random`"]) == 4
+        assert len(rows_of(tables.policies_table(others))["`random`"]) == 6
+
+
+def test_table_1_tells_how_many_confirmed_objects_are_wrong(evaluated):
+    row = evaluated["policies"]["random"]
+    for key, value in (("confirmed_rate", 0.61), ("wrong", 0.025)):
+        row |= {key: value, f"{key}_ci95_scenes": [value - 0.01, value + 0.01]}
+    cells = rows_of(tables.policies_table(evaluated))["`random`"]
+    assert cells[3:5] == [".610 (.600 to .620)", ".025 (.015 to .035)"]
 
 
 def test_a_loss_is_as_visible_as_a_win(evaluated):

@@ -18,8 +18,8 @@ from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import SPLITS, find_scene, load_scene
 
 #: Seeds of the piles beside a split's stored scenes start here. No stored scene and no pile that an estimator is
-#: trained on has such a seed. The test split has stored scenes only.
-FIRST_HEAP = {"train": 50_000, "val": 60_000}
+#: trained on has such a seed.
+FIRST_HEAP = {"train": 50_000, "val": 60_000, "test": 70_000}
 
 
 def scene_names(object_name: str, split: str, scenes: int | None, heaps: int) -> list[str]:
@@ -32,12 +32,12 @@ def scene_names(object_name: str, split: str, scenes: int | None, heaps: int) ->
         heaps: number of simulated piles.
 
     Raises:
-        ValueError: an unknown object or split, piles for the test split, or missing stored scenes.
+        ValueError: an unknown object or split, piles for a split of wild scenes, or missing stored scenes.
     """
     if split not in SPLITS:
         raise ValueError(f"--split '{split}' is not among {', '.join(SPLITS)}")
     if heaps and split not in FIRST_HEAP:
-        raise ValueError(f"--heaps adds to the scenes of {' and '.join(FIRST_HEAP)}, not to split '{split}'")
+        raise ValueError(f"--heaps adds to the scenes of {', '.join(FIRST_HEAP)}, not to split '{split}'")
     load_object(object_name)
     load_scene(object_name, split, 0)  # says how to make the stored scenes if they are missing
     stored = [f"{object_name}/{split}/{index}" for index in range(min(scenes or SPLITS[split], SPLITS[split]))]

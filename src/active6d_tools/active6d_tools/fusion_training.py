@@ -50,13 +50,14 @@ def fit_fusion(
     """
     common: dict[str, Any] = {"episodes": episodes, "estimator": estimator, "seed": seed}
     labelled, described = [], []
-    for name, found in _in_processes(partial(label_scene, **common), _names(objects, (BELIEF_SPLIT,), scenes), workers):
+    fitted, checked = (_names(objects, splits, scenes) for splits in ((BELIEF_SPLIT,), PROBABILITY_SPLITS))
+    for name, found in _in_processes(partial(label_scene, **common), fitted, workers):
         labelled += found
         on_scene(name)
     rotation, body = fit_belief(labelled, seed)
     weights = replace(BeliefWeights.indifferent(), rotation=rotation, body=body)
     describe = partial(describe_scene, weights=weights, **common)
-    for name, rows in _in_processes(describe, _names(objects, PROBABILITY_SPLITS, scenes), workers):
+    for name, rows in _in_processes(describe, checked, workers):
         described.append(rows)
         on_scene(name)
     table = np.concatenate(described)
@@ -66,7 +67,8 @@ def fit_fusion(
         "fused_objects": len(right),
         "right": float(right.mean()),
     }
-    provenance = {"objects": list(objects), **common, **measured}
+    counts = {"belief_scenes": len(fitted), "probability_scenes": len(checked)}
+    provenance = {"objects": list(objects), **common, **counts, **measured}
     return BeliefWeights(rotation, body, fit_probability(table[:, :-1], right), provenance), measured
 
 

@@ -1,13 +1,15 @@
 """The views of a stored scene as fusion receives them, for what fits and measures fusion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
+from active6d_core.se3 import invert, make_transform, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator
 from active6d_perception.model.ambiguity import ambiguity_of
@@ -45,6 +47,26 @@ class ProcessedView:
     hypotheses: Hypotheses
     verification: np.ndarray
     measured: MeasuredView
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """How wrong the poses of the camera are said to be: root mean squares of a shift and of a rotation angle."""
+
+    millimetres: float = 0.0
+    degrees: float = 0.0
+
+    def disturb(self, view: ProcessedView, rng: np.random.Generator) -> ProcessedView:
+        """The view with a wrong pose of its camera; what is in the camera's frame stays."""
+        if not (self.millimetres or self.degrees):
+            return view
+        angles = rng.normal(0.0, np.radians(self.degrees) / np.sqrt(3), 3)
+        shift = rng.normal(0.0, 1e-3 * self.millimetres / np.sqrt(3), 3)
+        T_camera_wrong = make_transform(Rotation.from_rotvec(angles).as_matrix(), shift)
+        T_world_wrong, T_camera_world = view.T_world_camera @ T_camera_wrong, invert(view.T_world_camera)
+        middles = transform_points(T_world_wrong @ T_camera_world, view.measured.middles)
+        measured = view.measured._replace(T_camera_world=invert(T_world_wrong), middles=middles)
+        return replace(view, T_world_camera=T_world_wrong, measured=measured)
 
 
 class ProcessedScene:

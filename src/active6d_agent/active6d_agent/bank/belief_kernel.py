@@ -4,7 +4,7 @@ The columns are those of :mod:`active6d_perception.scene.scene_evidence` and
 :mod:`active6d_perception.scene.object_probability`; a test compares them.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -104,9 +104,9 @@ class SceneIndex(NamedTuple):
     place: np.ndarray
     """(K,)"""
     body: np.ndarray
-    """(M, K, CASES) uint8, see :class:`.EvidenceTables`"""
+    """(M, K, 1, CASES) uint8, see :class:`.EvidenceTables`"""
     twin: np.ndarray
-    """(M, K, CASES) uint8"""
+    """(M, K, 1, CASES) uint8"""
     telling: np.ndarray
     """(M, K, R, CASES) uint8"""
     container: np.ndarray
@@ -118,7 +118,7 @@ class SceneIndex(NamedTuple):
     neighbour: np.ndarray
     """(P,) the other candidate of each pair"""
     pairs: np.ndarray
-    """(P, 2) of bodies, see :func:`.against_neighbour`"""
+    """(P, 1, 2) of bodies, see :func:`.against_neighbour`"""
     turned_pairs: np.ndarray
     """(P, R, 2) of the part that tells rotations apart"""
     positions: np.ndarray
@@ -146,20 +146,24 @@ class FusedEpisode(NamedTuple):
     """(n, columns) see :func:`.describe_objects`"""
 
 
+# Loops are inside of functions that are called once per candidate: a call that hands over arrays takes as long as what
+# is done for one rotation.
 @compiled
-def _score(columns: np.ndarray, scorer: FoldedScorer, units: np.ndarray) -> Any:
-    """Log-odds of (c,) columns, a number; (h,) ``units`` is overwritten."""
-    units[:] = scorer.offset
-    value = np.float32(scorer.constant)
-    for c in range(len(columns)):
-        x = columns[c]
-        if x != 0:
-            value += x * scorer.linear[c]
-            for h in range(len(units)):
-                units[h] += x * scorer.hidden[c, h]
-    for h in range(len(units)):
-        value += max(units[h], np.float32(0)) * scorer.out[h]
-    return value
+def _add_scores(columns: np.ndarray, scorer: FoldedScorer, odds: np.ndarray) -> None:
+    """Add the log-odds of (n, c) columns to (n,) ``odds``."""
+    units = np.empty(len(scorer.offset), np.float32)
+    for row in range(len(columns)):
+        units[:] = scorer.offset
+        value = np.float32(scorer.constant)
+        for c in range(columns.shape[1]):
+            x = columns[row, c]
+            if x != 0:
+                value += x * scorer.linear[c]
+                for h in range(len(units)):
+                    units[h] += x * scorer.hidden[c, h]
+        for h in range(len(units)):
+            value += max(units[h], np.float32(0)) * scorer.out[h]
+        odds[row] += value
 
 
 @compiled
@@ -199,24 +203,34 @@ def _heads(scene: SceneIndex, evidence: np.ndarray, proposed: np.ndarray) -> np.
 
 
 @compiled
-def _among(scene: SceneIndex, k: int, heads: np.ndarray, pairs: np.ndarray, r: int) -> tuple[float, float]:
-    """Share of a candidate in its neighbours, and the least distance to them; (P, R, 2) ``pairs``."""
-    share, nearest = 0.0, FREE
+def _pairs_of(scene: SceneIndex, k: int, heads: np.ndarray) -> np.ndarray:
+    """Pairs of a candidate with the heads of other places."""
+    chosen, count = np.empty(scene.first_pair[k + 1] - scene.first_pair[k], np.int64), 0
     for pair in range(scene.first_pair[k], scene.first_pair[k + 1]):
         if heads[scene.neighbour[pair]]:
-            share = min(share + pairs[pair, r, 0], 1.0)
-            nearest = min(nearest, pairs[pair, r, 1])
+            chosen[count] = pair
+            count += 1
+    return chosen[:count]
+
+
+@compiled
+def _among(chosen: np.ndarray, pairs: np.ndarray, r: int) -> tuple[float, float]:
+    """Share of a candidate in its neighbours, and the least distance to them; ``chosen`` of (P, R, 2) ``pairs``."""
+    share, nearest = 0.0, FREE
+    for pair in chosen:
+        share = min(share + pairs[pair, r, 0], 1.0)
+        nearest = min(nearest, pairs[pair, r, 1])
     return share, nearest
 
 
 @compiled
-def _sum_cases(table: np.ndarray, views: np.ndarray, k: int, cases: np.ndarray) -> None:
-    """Set (CASES,) counts to the sum over views of the squares in (M, K, CASES) ``table``."""
+def _sum_cases(table: np.ndarray, views: np.ndarray, k: int, r: int, cases: np.ndarray) -> None:
+    """Set (CASES,) counts to the sum over views of the squares in (M, K, R, CASES) ``table``."""
     cases[:] = 0
     for view in views:
-        row = table[view, k]
         for case in range(CASES):
-            cases[case] += np.float32(row[case]) * np.float32(row[case])
+            root = np.float32(table[view, k, r, case])
+            cases[case] += root * root
 
 
 @compiled
@@ -251,40 +265,35 @@ def _describe_body(
 
 
 @compiled
-def _describe_rotation(
-    scene: SceneIndex,
-    k: int,
-    r: int,
-    cases: np.ndarray,
-    mean_height: float,
-    near: tuple[float, float],
-    diameter: float,
-    columns: np.ndarray,
-) -> None:
-    """Set (columns,), see :data:`.ROTATION_COLUMNS`."""
-    for case in range(CASES):
-        columns[case] = _ROOT * np.sqrt(cases[case])
-    own, c = scene.turned[k, r], CASES
-    columns[c], columns[c + 1], columns[c + 2] = 10 * own[0], 10 * near[0], 10 * own[2]
-    columns[c + 3] = min(max(-own[1], 0.0), DEEPEST_IN_CONTAINER) / 0.01
-    columns[c + 4] = min(max(-near[1], 0.0), DEEPEST_IN_NEIGHBOUR) / 0.001
-    columns[c + 5] = min(max(own[3], 0.0), DEEPEST_IN_CONTAINER) / 0.01
-    columns[c + 6], columns[c + 7] = abs(own[1]) < TOUCHES_FLOOR, abs(near[1]) < TOUCHES_NEIGHBOUR
-    columns[c + 8] = (own[4] - mean_height) / (0.4 * diameter)
+def _sum_rotations(scene: SceneIndex, views: np.ndarray, k: int, columns: np.ndarray) -> None:
+    """Set the columns of cases of (R, columns), see :data:`.ROTATION_COLUMNS`."""
+    columns[:, :CASES] = 0
+    for view in views:
+        for r in range(len(columns)):
+            for case in range(CASES):
+                root = np.float32(scene.telling[view, k, r, case])
+                columns[r, case] += root * root
+    for r in range(len(columns)):
+        for case in range(CASES):
+            columns[r, case] = _ROOT * np.sqrt(columns[r, case])
 
 
 @compiled
-def _rotation_odds(
-    scene: SceneIndex, views: np.ndarray, k: int, heads: np.ndarray, belief: Belief, odds: np.ndarray
-) -> None:
-    """Add the log-odds of each rotation of a candidate to (R,) ``odds``."""
-    columns, cases = np.empty(_ROTATION, np.float32), np.empty(CASES, np.float32)
-    units, mean_height = np.empty(len(belief.rotation.offset), np.float32), scene.turned[k, :, 4].mean()
-    for r in range(len(odds)):
-        _sum_cases(scene.telling[:, :, r], views, k, cases)
-        near = _among(scene, k, heads, scene.turned_pairs, r)
-        _describe_rotation(scene, k, r, cases, mean_height, near, belief.diameter, columns)
-        odds[r] += _score(columns, belief.rotation, units)
+def _describe_rotations(scene: SceneIndex, k: int, chosen: np.ndarray, diameter: float, columns: np.ndarray) -> None:
+    """Set the other columns of (R, columns); ``chosen`` are the pairs with neighbours."""
+    mean_height, c = scene.turned[k, :, 4].mean(), CASES
+    for r in range(len(columns)):
+        share, nearest = 0.0, FREE
+        for pair in chosen:
+            share = min(share + scene.turned_pairs[pair, r, 0], 1.0)
+            nearest = min(nearest, scene.turned_pairs[pair, r, 1])
+        row, lowest, beyond = columns[r], scene.turned[k, r, 1], scene.turned[k, r, 3]
+        row[c], row[c + 1], row[c + 2] = 10 * scene.turned[k, r, 0], 10 * share, 10 * scene.turned[k, r, 2]
+        row[c + 3] = min(max(-lowest, 0.0), DEEPEST_IN_CONTAINER) / 0.01
+        row[c + 4] = min(max(-nearest, 0.0), DEEPEST_IN_NEIGHBOUR) / 0.001
+        row[c + 5] = min(max(beyond, 0.0), DEEPEST_IN_CONTAINER) / 0.01
+        row[c + 6], row[c + 7] = abs(lowest) < TOUCHES_FLOOR, abs(nearest) < TOUCHES_NEIGHBOUR
+        row[c + 8] = (scene.turned[k, r, 4] - mean_height) / (0.4 * diameter)
 
 
 @compiled
@@ -409,14 +418,15 @@ def _body_odds(
     rows, evidence, proposed, alone = _gather(scene, views)
     heads = _heads(scene, evidence, proposed)
     odds, best = np.full(len(proposed), -np.inf), np.full(scene.place.max() + 1, -np.inf)
-    twin, units = np.empty(CASES, np.float32), np.empty(len(belief.body.offset), np.float32)
+    twin = np.empty(CASES, np.float32)
     for k in range(len(proposed)):
         if proposed[k]:
-            _sum_cases(scene.body, views, k, bodies[k])
-            _sum_cases(scene.twin, views, k, twin)
-            near[k, 0], near[k, 1] = _among(scene, k, heads, scene.pairs, 0)
+            _sum_cases(scene.body, views, k, 0, bodies[k])
+            _sum_cases(scene.twin, views, k, 0, twin)
+            near[k, 0], near[k, 1] = _among(_pairs_of(scene, k, heads), scene.pairs, 0)
             columns = _describe_body(scene, k, bodies[k], twin, evidence[k], alone[k], near[k])
-            odds[k] = _score(columns, belief.body, units)
+            odds[k] = 0.0
+            _add_scores(columns.reshape(1, -1), belief.body, odds[k : k + 1])
             best[scene.place[k]] = max(best[scene.place[k]], odds[k])
     for k in range(len(odds)):
         if odds[k] <= best[scene.place[k]] - HOPELESS:
@@ -430,11 +440,13 @@ def fuse_episode(scene: SceneIndex, views: np.ndarray, current: int, belief: Bel
     K, R, places = len(scene.place), scene.telling.shape[2], scene.place.max() + 1
     bodies, near = np.empty((K, CASES), np.float32), np.empty((K, 2))
     rows, evidence, heads, body_odds = _body_odds(scene, views, belief, bodies, near)
-    odds, with_rows = np.empty((K, R)), 0
+    odds, rotations, with_rows = np.empty((K, R)), np.empty((R, _ROTATION), np.float32), 0
     for k in range(K):
         if body_odds[k] > -np.inf:
             odds[k] = body_odds[k]
-            _rotation_odds(scene, views, k, heads, belief, odds[k])
+            _sum_rotations(scene, views, k, rotations)
+            _describe_rotations(scene, k, _pairs_of(scene, k, heads), belief.diameter, rotations)
+            _add_scores(rotations, belief.rotation, odds[k])
     for view in views:
         with_rows += scene.first_row[view + 1] > scene.first_row[view]
     pose, entropy = np.empty(places, np.int64), np.empty(places)
@@ -457,16 +469,15 @@ def fuse_episode(scene: SceneIndex, views: np.ndarray, current: int, belief: Bel
                 best[n] = row
             if last == current and (seen[n] < 0 or scene.confidence[row] > scene.confidence[seen[n]]):
                 seen[n] = row
-        _sum_cases(scene.telling[:, :, r], views, k, telling)
+        _sum_cases(scene.telling, views, k, r, telling)
         scores, counts = (highest, total / len(members)), (support[n], with_rows)
         _describe_object(
             scene, k, r, (bodies[k], telling), near[k], evidence[k], (mass, entropy[n]), scores, counts, description[n]
         )
         n += 1
-    probability, units = np.empty(n), np.empty(len(belief.probability.offset), np.float32)
-    for index in range(n):
-        columns = description[index].astype(np.float32)
-        probability[index] = 1 / (1 + np.exp(-_score(columns, belief.probability, units)))
+    probability = np.zeros(n)
+    _add_scores(description[:n].astype(np.float32), belief.probability, probability)
+    probability = 1 / (1 + np.exp(-probability))
     kept = _suppress(pose[:n], probability, scene.positions, belief)
     return FusedEpisode(
         pose[kept],

@@ -3,15 +3,19 @@
 Evaluation and training share these functions; the Gymnasium environment shares the scoring.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from active6d_agent.bank.scene_lookup import FusedBatch, SceneLookup
 from active6d_agent.policies.registry import Observation
+from active6d_core.metrics import DETECTION_FRACTION, score_errors
 
 MEASURES = ("detection_rate", "e_add_mm", "distance_m")
+#: Measures of the objects that are confirmed by their probability.
+CONFIRMED = ("confirmed_rate", "wrong")
 #: From (b,) indices of the running episodes and their observations to (b,) next views, -1 to stop.
 Choose = Callable[[np.ndarray, list[Observation]], np.ndarray]
 
@@ -26,6 +30,8 @@ class EpisodeResults:
         e_add_mm: (E,) mean over the objects, 50 mm for the missed.
         distance_m: (E,) along the hemisphere.
         views: (E, T + 1) views taken, -1 after an early stop.
+        confirmed_rate: (E,) fraction of the objects that a confirmed object finds; None if there is no probability.
+        wrong: (E,) share of the confirmed objects that find none, 0 without any; None likewise.
     """
 
     scene: np.ndarray
@@ -33,11 +39,21 @@ class EpisodeResults:
     e_add_mm: np.ndarray
     distance_m: np.ndarray
     views: np.ndarray
+    confirmed_rate: np.ndarray | None = None
+    wrong: np.ndarray | None = None
 
     @property
     def measures(self) -> dict[str, np.ndarray]:
-        """The paper's three measures by name, (E,) each."""
-        return {name: getattr(self, name) for name in MEASURES}
+        """The paper's three measures and those of confirmed objects that are known, by name, (E,) each."""
+        values = {name: getattr(self, name) for name in (*MEASURES, *CONFIRMED)}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @classmethod
+    def join(cls, parts: "Sequence[EpisodeResults]") -> "EpisodeResults":
+        """The episodes of all parts, one after the other."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        joined: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
+        return cls(*joined)
 
     @property
     def means(self) -> tuple[float, float, float]:
@@ -127,10 +143,24 @@ def score_fused(lookup: SceneLookup, fused: FusedBatch, scene: np.ndarray, views
     scores = lookup.evaluate(fused, scene)
     positions = lookup.sphere.positions[views]
     arcs = np.where(views[:, 1:] >= 0, lookup.sphere.arc(positions[:, :-1], positions[:, 1:]), 0.0)
+    confirmed = _score_confirmed(lookup, fused, scene)
     return EpisodeResults(
+        confirmed_rate=confirmed[:, 0],
+        wrong=confirmed[:, 1],
         scene=scene,
         detection_rate=np.array([score.detection_rate for score in scores]),
         e_add_mm=np.array([score.mean_e_add_mm for score in scores]),
         distance_m=arcs.sum(axis=1),
         views=views,
     )
+
+
+def _score_confirmed(lookup: SceneLookup, fused: FusedBatch, scene: np.ndarray) -> np.ndarray:
+    """(E, 2) fraction of the objects that confirmed ones find, and share of the confirmed ones that find none."""
+    limit, result = DETECTION_FRACTION * lookup.model.diameter, np.zeros((len(scene), 2))
+    sure = (fused.objects >= 0) & (fused.probability >= lookup.parameters.confirmed)
+    for row, objects, own, count in zip(result, fused.objects, sure, lookup.object_count[scene], strict=True):
+        errors = lookup.errors[objects[own], :count]
+        row[0] = score_errors(errors, lookup.model.diameter).detection_rate
+        row[1] = 1 - (errors < limit).any(axis=1).mean() if own.any() else 0.0
+    return result

@@ -107,7 +107,8 @@ def _all_views(lookup: SceneLookup, starts: np.ndarray) -> EpisodeResults:
     views = (grid + starts[:, 1:]) % len(grid)
     steps = lookup.sphere.positions[views]
     metres = lookup.sphere.arc(steps[:, :-1], steps[:, 1:]).sum(axis=1)
-    return EpisodeResults(starts[:, 0], once.detection_rate[inverse], once.e_add_mm[inverse], metres, views)
+    shared = {name: values[inverse] for name, values in once.measures.items()}
+    return EpisodeResults(**{**shared, "scene": starts[:, 0], "distance_m": metres, "views": views})
 
 
 class Intervals:
@@ -178,8 +179,7 @@ def evaluate(
         for some in np.array_split(starts, -(-len(starts) // _TOGETHER)):
             parts.append(run_named(lookup, name, some, steps, seed=seed, parameters=(parameters or {}).get(name)))
             on_progress(name, len(some))
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        yield name, EpisodeResults(*map(np.concatenate, columns))
+        yield name, EpisodeResults.join(parts)
 
 
 def describe(measures: Measures, intervals: Intervals, first: Measures | None = None) -> dict[str, Any]:

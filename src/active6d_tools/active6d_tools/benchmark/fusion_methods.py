@@ -11,7 +11,7 @@ from active6d_core.registry import AUTOMATIC
 from active6d_perception.estimators.detection_rates import area_under_curve, calibration_error
 from active6d_perception.scene.fusion import FusionParameters, SceneFusion
 from active6d_perception.scene.joint_fusion import JointFusion
-from active6d_tools.processed_scene import RING_VIEWS, ProcessedScene, ProcessedView, add_view
+from active6d_tools.processed_scene import RING_VIEWS, PoseError, ProcessedScene, ProcessedView, add_view
 
 #: The views of an episode: six evenly on a ring at 45 degrees, six at random, or all of the grid.
 KINDS = ("ring", "random", "all")
@@ -72,6 +72,7 @@ def compare_methods(
     estimator: str = AUTOMATIC,
     seed: int = 0,
     parameters: FusionParameters | None = None,
+    pose_error: PoseError | None = None,
     on_progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> dict[str, dict[str, dict[str, float | None]]]:
     """Fuse the same views by every method.
@@ -83,12 +84,13 @@ def compare_methods(
         estimator: name of the deployed one.
         seed: of the views and of the sensor's noise.
         parameters: of the fusion.
+        pose_error: of the camera's poses; none when None.
         on_progress: called with a scene's name, the number of scenes done and that of all.
 
     Returns:
         Kind to method to :meth:`MethodResults.summarise`.
     """
-    parameters = parameters or FusionParameters()
+    parameters, pose_error = parameters or FusionParameters(), pose_error or PoseError()
     results: dict[str, dict[str, MethodResults]] = {kind: {} for kind in kinds}
     for done, name in enumerate(names):
         on_progress(name, done, len(names))
@@ -98,7 +100,8 @@ def compare_methods(
             "all-views": JointFusion(processed.model, parameters),
         }
         rng = np.random.default_rng([seed + 1, int(name.split("/")[-1])])
-        for kind, views in _draw_episodes(processed, kinds, episodes, rng):
+        for kind, exact in _draw_episodes(processed, kinds, episodes, rng):
+            views = [pose_error.disturb(view, rng) for view in exact]
             for method, fusion in methods.items():
                 result = results[kind].setdefault(method, MethodResults(processed.model.diameter))
                 _fuse(fusion, views, result, processed)

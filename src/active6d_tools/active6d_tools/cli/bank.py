@@ -15,7 +15,7 @@ def bank(
     split: Split = "test",
     estimator: Annotated[str, typer.Option(help="Estimator for each view: auto, {estimators}.")] = "auto",
     scenes: Annotated[int | None, typer.Option(min=1, help="Number of stored scenes; by default all.")] = None,
-    heaps: Annotated[int, typer.Option(min=0, help="Number of additional simulated piles; for train and val.")] = 0,
+    heaps: Annotated[int, typer.Option(min=0, help="Number of additional simulated piles; not for wild scenes.")] = 0,
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the noise of the simulated sensor.")] = 1.0,
     workers: Annotated[int, typer.Option(min=0, help="Number of processes; 0 for one per core.")] = 0,
     imports: Imports = None,

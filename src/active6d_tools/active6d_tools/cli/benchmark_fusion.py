@@ -35,6 +35,12 @@ def fusion(
     confirmed: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Least probability of the objects that count.")
     ] = 0.5,
+    pose_error_mm: Annotated[
+        float, typer.Option(min=0.0, help="Shift of the camera's poses, root mean square in millimetres.")
+    ] = 0.0,
+    pose_error_degrees: Annotated[
+        float, typer.Option(min=0.0, help="Rotation of the camera's poses, root mean square in degrees.")
+    ] = 0.0,
     estimator: Annotated[str, typer.Option(help="Estimator for each view: auto, {estimators}.")] = "auto",
     seed: Seed = 0,
     json_file: JsonFile = None,
@@ -47,6 +53,7 @@ def fusion(
     from active6d_perception.scene.fusion import FusionParameters
     from active6d_sim.scenes.scene_store import SPLITS, load_scene
     from active6d_tools.benchmark.fusion_methods import KINDS, compare_methods
+    from active6d_tools.processed_scene import PoseError
 
     chosen = [kind.strip() for kind in kinds.split(",")]
     if unknown := set(chosen) - set(KINDS):
@@ -57,7 +64,11 @@ def fusion(
     settings: dict[str, Any] = {"kinds": chosen, "episodes": episodes, "estimator": estimator, "seed": seed}
     with work_progress() as on_progress:
         results = compare_methods(
-            names, **settings, parameters=FusionParameters(confirmed=confirmed), on_progress=on_progress
+            names,
+            **settings,
+            parameters=FusionParameters(confirmed=confirmed),
+            pose_error=PoseError(pose_error_mm, pose_error_degrees),
+            on_progress=on_progress,
         )
     for kind, methods in results.items():
         rows = [
@@ -66,5 +77,12 @@ def fusion(
         ]
         title = f"{object_name}, {kind} views, {len(names)} scenes of {split}; confirmed: at least {confirmed:g}"
         print_table(("method", *_COLUMNS.values()), rows, title=title)
-    report = {"object": object_name, "split": split, "scenes": len(names), "confirmed": confirmed, **settings}
+    report: dict[str, Any] = {
+        "object": object_name,
+        "split": split,
+        "scenes": len(names),
+        "confirmed": confirmed,
+        **settings,
+    }
+    report |= {"pose_error_mm": pose_error_mm, "pose_error_degrees": pose_error_degrees}
     write_json(json_file, {**report, "results": results})

@@ -152,9 +152,12 @@ def _print_policies(summary: dict[str, Any]) -> None:
         for key, digits in (("e_add_mm", 2), ("detection_rate", 3)):
             low, high = row[f"{key}_ci95_scenes"]
             cells += [f"{row[key]:.{digits}f}", f"[dim]{low:.{digits}f}-{high:.{digits}f}[/dim]"]
+        cells += [f"{row[key]:.3f}" if key in row else "-" for key in ("confirmed_rate", "wrong")]
         rows.append([*cells, "-" if row["gap_closed"] is None else f"{row['gap_closed']:.0%}"])
     title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
-    print_table(("policy", "distance, m", "ADD, mm", "", "detected", "", "gap closed"), rows, title=title)
+    print_table(
+        ("policy", "distance, m", "ADD, mm", "", "detected", "", "confirmed", "wrong", "gap closed"), rows, title=title
+    )
 
 
 def _print_differences(summary: dict[str, Any]) -> None:

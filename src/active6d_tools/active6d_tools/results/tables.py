@@ -17,6 +17,8 @@ MEASURES = {
     "distance_m": (" m", 2, -1),
     "moves": (" moves", 1, 0),
     "reported": (" per object", 2, 0),
+    "confirmed_rate": (" confirmed", 3, 1),
+    "wrong": (" wrong", 3, -1),
 }
 PAPER_STEPS = 5
 #: Table 1 of the paper, after five moves: metres, ADD in mm, detection rate.
@@ -72,13 +74,14 @@ def mark(difference: dict[str, Any], better: int) -> str:
 def policies_table(report: dict[str, Any]) -> str:
     """The paper's Table 1, with intervals over scenes, bounds, and the paper's numbers where it has any."""
     paper = PAPER.get(report["object"], {}) if report["steps"] == PAPER_STEPS else {}
-    header = ["policy", "distance, m", "ADD, mm", "detection rate", "gap closed"]
+    header = ["policy", "distance, m", "ADD, mm", "detection rate", "confirmed", "wrong", "gap closed"]
     rows = []
     for name, row in report["policies"].items():
         cells = [f"`{name}`", number(row["distance_m"], 2)]
-        for key in ("e_add_mm", "detection_rate"):
+        for key in ("e_add_mm", "detection_rate", "confirmed_rate", "wrong"):
             digits = MEASURES[key][1]
-            cells.append(f"{number(row[key], digits)} {interval(row[f'{key}_ci95_scenes'], digits)}")
+            known = key in row
+            cells.append(f"{number(row[key], digits)} {interval(row[f'{key}_ci95_scenes'], digits)}" if known else "")
         cells.append("" if row["gap_closed"] is None else percent(row["gap_closed"]))
         if paper:
             metres, error, rate = paper.get(name, (None, None, None))
@@ -116,6 +119,26 @@ def describe_row(row: dict[str, Any], keys: Sequence[str]) -> str:
         sign = mark(against[key], better) if against else ""
         parts.append(f"{sign} {number(row[key], digits)}{unit}".strip())
     return ", ".join(parts)
+
+
+def fusion_methods_table(reports: Reports) -> str:
+    """Objects, kinds of views and methods of fusion as rows; what is found, and how good the probability is."""
+    columns = {
+        "found_of_all": ("found", 3),
+        "e_add_mm": ("ADD, mm", 2),
+        "median_e_add_mm": ("median of found, mm", 2),
+        "found": ("found, confirmed", 3),
+        "wrong": ("wrong of confirmed", 3),
+        "auc": ("AUC", 3),
+        "calibration_error": ("calibration error", 3),
+    }
+    rows = []
+    for name, report in reports.items():
+        for kind, methods in report["results"].items():
+            for method, row in methods.items():
+                cells = ("" if row[key] is None else number(row[key], digits) for key, (_, digits) in columns.items())
+                rows.append([name, kind, f"`{method}`", *cells])
+    return table(["", "views", "method", *(text for text, _ in columns.values())], rows)
 
 
 def seeds_table(reports: Reports) -> str:
