@@ -71,12 +71,8 @@ def fusion(
             on_progress=on_progress,
         )
     for kind, methods in results.items():
-        rows = [
-            (method, *("-" if row[key] is None else f"{row[key]:.{_DIGITS.get(key, 3)}f}" for key in _COLUMNS))
-            for method, row in methods.items()
-        ]
         title = f"{object_name}, {kind} views, {len(names)} scenes of {split}; confirmed: at least {confirmed:g}"
-        print_table(("method", *_COLUMNS.values()), rows, title=title)
+        _print_methods(methods, title)
     report: dict[str, Any] = {
         "object": object_name,
         "split": split,
@@ -86,3 +82,11 @@ def fusion(
     }
     report |= {"pose_error_mm": pose_error_mm, "pose_error_degrees": pose_error_degrees}
     write_json(json_file, {**report, "results": results})
+
+
+def _print_methods(methods: dict[str, dict[str, float | None]], title: str) -> None:
+    rows = []
+    for method, row in methods.items():
+        values = [(row[key], _DIGITS.get(key, 3)) for key in _COLUMNS]
+        rows.append((method, *("-" if value is None else f"{value:.{digits}f}" for value, digits in values)))
+    print_table(("method", *_COLUMNS.values()), rows, title=title)
