@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from active6d_agent.bank.candidate_pruning import prune_candidates
 from active6d_agent.bank.scene_bank import BankScene, SceneBank, observe_scene
 from active6d_core.files import sha256_of
 from active6d_core.metrics import DETECTION_FRACTION
@@ -54,21 +55,27 @@ def bank_provenance(object_name: str, estimator: str, noise: float, seed: int) -
 
 
 def observe_scene_by_name(name: str, *, estimator: str, noise: float, seed: int, sensor: str = AUTOMATIC) -> BankScene:
-    """Observe one scene from every view with the deployed estimator and verification; runs in its own process."""
+    """Observe one scene from every view with the deployed estimator and verification; runs in its own process.
+
+    Candidates that hardly any choice of views makes probable are left out, see :mod:`.candidate_pruning`.
+    """
     object_name, kind, number = name.split("/")
     model = load_object(object_name)
     scene = find_scene(object_name, "", int(number)) if kind == "seed" else find_scene(object_name, name, 0)
     simulator = Simulator(scene, noise=sensor_of(sensor, model, scene).scaled(noise), seed=seed)
-    return observe_scene(
+    sphere, grid = ViewSphere(), SurfaceGrid.for_model(model)
+    observed = observe_scene(
         name,
         scene.T_world_object,
         simulator.capture,
         create_estimator(estimator, model),
         Verifier(model),
         model,
-        ViewSphere(),
-        SurfaceGrid.for_model(model),
+        sphere,
+        grid,
     )
+    bank = SceneBank(object_name, sphere, grid, [observed], {})
+    return prune_candidates(bank, np.random.default_rng(seed)).scenes[0]
 
 
 def summarise_bank(bank: SceneBank) -> dict[str, Any]:

@@ -125,6 +125,9 @@ class JointLookup(SceneLookup):
         parameters: of the fusion, those of the node by default.
         camera: that boxes are projected into.
         weights: of the belief; those of the object when None.
+
+    Attributes:
+        scenes: what the kernel needs of each scene of the bank.
     """
 
     def __init__(
@@ -137,7 +140,7 @@ class JointLookup(SceneLookup):
         super().__init__(bank, parameters, camera)
         weights = weights or load_belief(belief_path(self.model.name))
         self._belief = make_belief(self.model, weights, self.parameters)
-        self._scenes = [index_scene(scene, self.model, self.sphere, self._belief.cut) for scene in bank.scenes]
+        self.scenes = [index_scene(scene, self.model, self.sphere, self._belief.cut) for scene in bank.scenes]
         self._first_row = np.cumsum([0, *(len(scene.view) for scene in bank.scenes)])
         self._set_hypotheses(np.concatenate([scene.table for scene in bank.scenes]).astype(float))
         poses = [evidence_of(scene).T_world_object.reshape(-1, 4, 4) for scene in bank.scenes]
@@ -151,7 +154,7 @@ class JointLookup(SceneLookup):
         """Fuse the views of E episodes; see :meth:`.SceneLookup.fuse`."""
         taken = np.asarray(views, np.int64)
         fused = [
-            fuse_episode(self._scenes[index], np.unique(row[row >= 0]), int(now), self._belief)
+            fuse_episode(self.scenes[index], np.unique(row[row >= 0]), int(now), self._belief)
             for index, row, now in zip(scene.tolist(), taken, current.tolist(), strict=True)
         ]
         most = max((len(each.pose) for each in fused), default=0)

@@ -59,6 +59,15 @@ class EvidenceTables:
         if not (np.isfinite(self.T_world_body).all() and np.isfinite(self.T_world_object).all()):
             raise ValueError("evidence: a pose is not finite")
 
+    def take(self, index: np.ndarray) -> "EvidenceTables":
+        """The candidates at ``index``, in that order; places are numbered again."""
+        return EvidenceTables(
+            self.T_world_body[index],
+            np.unique(self.place[index], return_inverse=True)[1],
+            self.T_world_object[index],
+            *(np.ascontiguousarray(table[:, index]) for table in (self.body, self.twin, self.telling)),
+        )
+
 
 def tabulate(fusion: JointFusion) -> EvidenceTables:
     """The tables of all views of ``fusion``, in the order of their stamps."""
