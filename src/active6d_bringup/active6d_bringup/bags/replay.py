@@ -145,14 +145,15 @@ def replay(
         graph.add(listener)
         started = time.monotonic()
         graph.start()
-        description.name_others(listener, on_event)
-        answered, deadline = -1, 0.0
+        answered, deadline, named = -1, 0.0, False
         while len(listener.answered(stamps)) < len(stamps):
             if interrupted.is_set():
                 raise EpisodeInterrupted
             if answered != len(listener.answered(stamps)):
                 answered, deadline = len(listener.answered(stamps)), time.monotonic() + settings.patience
                 on_view(answered, len(stamps))
+                # Again with every view: nodes are not discovered at once.
+                named = named or description.name_others(listener, on_event)
             elif time.monotonic() > deadline:
                 silent = f"no objects of view {answered + 1} of {len(stamps)} in {settings.patience:.0f} s"
                 raise EpisodeError("; ".join([silent, *listener.causes.values()]))

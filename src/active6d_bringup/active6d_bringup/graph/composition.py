@@ -74,13 +74,14 @@ class GraphDescription:
     def _claim(self) -> DomainClaim:
         return DomainClaim(self.domain if self.domain is not None else domain_of(), self.namespace)
 
-    def name_others(self, node: Node, on_event: OnEvent) -> None:
-        """Report other nodes in a domain that the user named, as ``node`` of this graph has discovered them."""
+    def name_others(self, node: Node, on_event: OnEvent) -> bool:
+        """Report other nodes in a domain that the user named, if ``node`` of this graph has discovered any."""
         if self.domain is None and domain_of() is None:
-            return
+            return False
         space = f"/{self.namespace.strip('/')}/" if self.namespace else "/"
         if others := others_in_domain(node, [space + name for name in (*self.nodes, "supervisor")]):
             on_event(f"also in ROS domain {self.domain_id()}: {', '.join(others)}")
+        return bool(others)
 
     def release_domain(self) -> None:
         """Let others have the domain."""
