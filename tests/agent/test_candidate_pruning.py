@@ -13,7 +13,7 @@ from active6d_core.se3 import make_transform
 
 @pytest.fixture(scope="module")
 def bank():
-    whole = load_bank(bank_path(SHIPPED_BANKS, "bunny", "test"))
+    whole = load_bank(bank_path(SHIPPED_BANKS, "mug", "test"))
     return replace(whole, scenes=whole.scenes[:1])
 
 
@@ -52,6 +52,11 @@ def test_hopeless_candidates_go_and_what_is_found_stays(bank):
             np.mean([score.detected for score in lookup.evaluate(lookup.fuse(scene, views, views[:, -1]), scene)])
         )
     assert found[1] == pytest.approx(found[0], abs=0.005)
+
+
+def test_an_object_without_ambiguous_rotation_keeps_all_candidates():
+    bunnies = load_bank(bank_path(SHIPPED_BANKS, "bunny", "test"))
+    assert prune_candidates(bunnies, np.random.default_rng(0)) is bunnies
 
 
 def test_a_bank_without_evidence_is_refused(bank):
