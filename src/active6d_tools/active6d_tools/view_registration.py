@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from active6d_core.se3 import invert, make_transform, transform_points
 
@@ -114,10 +115,9 @@ def _fit(a: np.ndarray, b: np.ndarray, T: np.ndarray, near: float) -> tuple[np.n
 
 
 def _align(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """``T_a_b`` (4, 4) of least squares between corresponding points (k, 3) (Kabsch 1976)."""
+    """``T_a_b`` (4, 4) of least squares between corresponding points (k, 3)."""
     middle_a, middle_b = a.mean(axis=0), b.mean(axis=0)
-    U, _, Vt = np.linalg.svd((a - middle_a).T @ (b - middle_b))
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    R = Rotation.align_vectors(a - middle_a, b - middle_b)[0].as_matrix()
     return make_transform(R, middle_a - R @ middle_b)
 
 

@@ -13,6 +13,7 @@ from active6d_perception.model.visible_samples import VisibleSamples, direction_
 #: Columns of :func:`weigh_poses`.
 EVIDENCE = ("fitting", "violated", "occluded", "near", "unmeasured", "outside", "confirmed", "continued")
 FITTING, VIOLATED, OCCLUDED, NEAR, UNMEASURED, OUTSIDE, CONFIRMED, CONTINUED = range(len(EVIDENCE))
+_LEAST_COMPARABLE = 0.1
 
 
 class Judge(NamedTuple):
@@ -122,6 +123,15 @@ def _weigh_outline(P: np.ndarray, direction: int, judge: Judge, image: MeasuredI
             result[CONFIRMED] += 1.0 / number
         elif abs(behind) <= 2 * tolerance:
             result[CONTINUED] += 1.0 / number
+
+
+def comparable_share(evidence: np.ndarray) -> np.ndarray:
+    """(...,) share of the surface that is neither occluded nor unmeasured nor outside, at least 0.1, to divide by.
+
+    Args:
+        evidence: (..., 8) of :func:`weigh_poses`.
+    """
+    return np.maximum(1.0 - evidence[..., [OCCLUDED, UNMEASURED, OUTSIDE]].sum(axis=-1), _LEAST_COMPARABLE)
 
 
 @compiled

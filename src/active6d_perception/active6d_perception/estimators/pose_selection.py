@@ -15,11 +15,9 @@ from active6d_perception.estimators.pose_evidence import (
     EVIDENCE,
     FITTING,
     NEAR,
-    OCCLUDED,
-    OUTSIDE,
-    UNMEASURED,
     VIOLATED,
     Judge,
+    comparable_share,
     explained_shares,
     weigh_poses,
 )
@@ -32,7 +30,6 @@ from active6d_perception.model.visible_samples import visible_samples
 #: What poses are compared by: the evidence of the depth image, three of its shares also of the surface that is neither
 #: occluded nor unknown, and the share of the instance's points that fit.
 FEATURES = (*EVIDENCE, "fitting_comparable", "violated_comparable", "near_comparable", "explained")
-_LEAST_COMPARABLE = 0.1
 #: Weights of the features.
 SELECTION_FILE = Path(__file__).parent / "pose_selection.json"
 
@@ -117,7 +114,6 @@ def pose_features(
     """(n, c, f) :data:`FEATURES`; arguments as for :meth:`PoseSelection.value`, judge and grid are the object's."""
     T = np.ascontiguousarray(T_camera_object)
     evidence = weigh_poses(T.reshape(-1, 4, 4), judge, image).reshape(*T.shape[:2], len(EVIDENCE))
-    comparable = np.maximum(1.0 - evidence[..., [OCCLUDED, UNMEASURED, OUTSIDE]].sum(axis=-1), _LEAST_COMPARABLE)
-    shares = evidence[..., [FITTING, VIOLATED, NEAR]] / comparable[..., None]
+    shares = evidence[..., [FITTING, VIOLATED, NEAR]] / comparable_share(evidence)[..., None]
     explained = explained_shares(T, *of_instances, grid, judge.tolerance)
     return np.concatenate([evidence, shares, explained[..., None]], axis=-1)

@@ -19,10 +19,9 @@ from active6d_perception.estimators.pose_evidence import (
     CONTINUED,
     FITTING,
     NEAR,
-    OCCLUDED,
-    OUTSIDE,
     UNMEASURED,
     VIOLATED,
+    comparable_share,
     weigh_poses,
 )
 from active6d_perception.estimators.pose_selection import judge_of, length_scale
@@ -37,8 +36,6 @@ _ROUGH_GATES = np.array([0.02, 0.012])
 _FINE_GATES = np.array([0.012, 0.008, 0.006])
 # Weight of a sample that the camera looked through against one that fits.
 _VIOLATION = 1.5
-# Share of a pose's surface that features are given over, at least.
-_LEAST_COMPARABLE = 0.1
 # Measured points that are paired with others. A heap shows under four thousand; noise fills all space.
 _MOST_POINTS = 8000
 # Starts kept at each measured point.
@@ -164,7 +161,7 @@ class GeometricEstimator:
         """(k, f) :data:`FEATURES` of (k, 4, 4) poses that claim (k,) pixels."""
         # The area that its pixels cover at the object's distance, in squares of the diameter: the same for all cameras.
         covered = pixels * poses[:, 2, 3] ** 2 / (camera.fx * camera.fy)
-        comparable = np.maximum(1.0 - evidence[:, [OCCLUDED, UNMEASURED, OUTSIDE]].sum(axis=1), _LEAST_COMPARABLE)
+        comparable = comparable_share(evidence)
         area_share = covered / (self._silhouette_area(poses) * comparable)
         return np.column_stack(
             [
