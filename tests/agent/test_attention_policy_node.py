@@ -7,13 +7,15 @@ import pytest
 import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
 from rclpy.parameter import Parameter
-from ros_harness import GraphHarness
+from ros_harness import GraphHarness, reliable
 from sensor_msgs.msg import PointCloud2
 from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.environment.gym_environment import Active6DEnv
+from active6d_agent.nodes import attention_policy
 from active6d_agent.nodes.attention_policy import AttentionPolicyNode
 from active6d_agent.policies.attention.network import AttentionNetwork, save_network
 from active6d_agent.policies.registry import Decision, register_policy
@@ -282,6 +284,57 @@ def test_a_view_under_way_stops_the_clock_of_its_goal(episode):
     played.pose(played.goal_views()[0], 2 * SECOND)
     played.graph.spin_for(1.0)
     assert len(played.goals) == 1
+
+
+def camera_that_answers(played):
+    """A camera that joins now; what it hears."""
+    camera, heard = Node("camera", context=played.graph.context), []
+    played.graph.add(camera)
+    camera.create_publisher(DiagnosticArray, "view_goal/status", reliable(latched=True))
+    camera.create_subscription(PoseStamped, "view_goal", heard.append, reliable())
+    played.graph.spin_until(lambda: played.node.count_publishers("view_goal/status"))
+    return heard
+
+
+def test_a_goal_without_an_answer_comes_again_for_a_camera_that_joins_late(episode, monkeypatch):
+    monkeypatch.setattr(attention_policy, "_REPEAT_SECONDS", 0.3)
+    played = episode(goal_timeout=0.0)
+    played.view(10)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+    played.graph.spin_for(0.7)
+    assert len(played.goals) == 1, "nobody here answers goals: a second one would be a second move"
+    heard = camera_that_answers(played)
+    played.graph.spin_until(lambda: heard)
+    assert heard[0] == played.goals[0]
+    answer(played, GoalState.ACCEPTED)
+    played.graph.spin_for(0.3)
+    count = len(played.goals)
+    played.graph.spin_for(0.7)
+    assert len(played.goals) == count, "an accepted goal is not repeated"
+
+
+def test_a_goal_whose_view_is_coming_is_not_repeated(episode, monkeypatch):
+    monkeypatch.setattr(attention_policy, "_REPEAT_SECONDS", 0.3)
+    played = episode()
+    played.view(10)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+    camera_that_answers(played)
+    played.pose(played.goal_views()[0], 2 * SECOND)
+    played.graph.spin_for(1.0)
+    assert len(played.goals) == 1
+
+
+def test_camera_and_arm_may_both_answer_goals(episode):
+    played = episode(policy="max-distance")
+    played.view(40)
+    played.graph.spin_until(lambda: len(played.goals) == 1)
+    arm = Node("arm", context=played.graph.context)
+    played.graph.add(arm)
+    status = arm.create_publisher(DiagnosticArray, "view_goal/status", reliable(latched=True))
+    answer(played, GoalState.ACCEPTED)
+    status.publish(GoalStatus(played.stamp, "world", GoalState.REFUSED, "no plan").to_message())
+    played.graph.spin_until(lambda: len(played.goals) == 2)
+    assert played.errors() == []
 
 
 def test_an_announced_episode_may_wait_for_its_first_view(episode):

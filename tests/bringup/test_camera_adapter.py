@@ -117,6 +117,23 @@ def test_a_goal_is_answered_by_one_fresh_view_from_there(graph):
     assert len(cell.starts) == 1
 
 
+def test_a_repeated_goal_and_one_of_an_older_view_move_nothing(graph):
+    cell = Cell(graph)
+    cell.first_view()
+    first = stamp_to_ns(cell.pose[0].header.stamp)
+    cell.ask(POSES[1])
+    goal = transform_to_pose_stamped(POSES[1], first, "world")
+    graph.publish(topics.VIEW_GOAL.name, goal)
+    cell.stands_at(POSES[1])
+    cell.driver.run_until(lambda: len(cell.depth) == 2)
+    graph.publish(topics.VIEW_GOAL.name, goal)
+    graph.publish(topics.VIEW_GOAL.name, transform_to_pose_stamped(POSES[2], first, "world"))
+    graph.spin_until(lambda: cell.said("stale goal"))
+    cell.driver.run(30)
+    assert len(cell.depth) == 2
+    assert cell.states() == [GoalState.ACCEPTED, GoalState.REACHED]
+
+
 def test_a_camera_that_stops_elsewhere_refuses_and_names_the_distance(graph):
     cell = Cell(graph, parameters={"settle_seconds": 1.0})
     cell.first_view()

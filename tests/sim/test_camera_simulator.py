@@ -22,7 +22,7 @@ from active6d_core.ros.conversions import (
     transform_to_pose_stamped,
 )
 from active6d_core.ros.episode_messages import GoalState, GoalStatus
-from active6d_core.se3 import look_at
+from active6d_core.se3 import look_at, make_transform
 from active6d_sim.nodes.camera_simulator import CameraSimulatorNode
 from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.sensor_registry import list_sensors, register_sensor
@@ -235,6 +235,18 @@ def test_goals_decided_on_older_views_are_stale(watched):
     watched.wait(3)
     same_pose(watched.poses()[2], SPHERE.pose(SPHERE.positions[80]))
     assert len(watched.poses()) == 3
+
+
+def test_a_repeated_goal_is_answered_once(watched):
+    """A second refusal would be taken for the answer to the goal that the policy chose instead, of the same stamp."""
+    watched.start()
+    below = make_transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, -0.8]))
+    for T in (below, below, SPHERE.pose(SPHERE.positions[60])):
+        watched.goal(T, stamp=SECOND)
+    watched.wait(2)
+    watched.graph.spin_until(lambda: len(watched.answers) >= 3)
+    states = [status.state for status in watched.statuses()]
+    assert states == [GoalState.REFUSED, GoalState.ACCEPTED, GoalState.REACHED]
 
 
 def test_every_goal_is_answered_with_its_own_stamp(watched):

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 
 from active6d_agent.policies.episode_state import EpisodeState, Limits
@@ -30,6 +32,8 @@ from active6d_core.view_sphere import ViewSphere
 #: What belongs to a view beside the camera's pose, part to topic.
 _OTHERS = {"objects": "objects", "unexplained": "objects/unexplained"}
 _TICKS_PER_TIMEOUT = 10
+#: A goal that got no answer for so long is published again: the camera may not have discovered this node before.
+_REPEAT_SECONDS = 3.0
 
 
 class AttentionPolicyNode(GraphNode):
@@ -69,7 +73,7 @@ class AttentionPolicyNode(GraphNode):
         self.input(topics.UNEXPLAINED, self._on_unexplained)
         self._views = ViewInputs(self, ["pose"], self._on_view, _OTHERS, self._on_start)
         self.input(topics.GOAL_STATUS, self._on_status)
-        self._timer = None
+        self._timers: list[Timer] = []
         self._forget()
 
     def setup(self) -> None:
@@ -84,20 +88,22 @@ class AttentionPolicyNode(GraphNode):
         if timeout > 0:
             # Ticks, not a deadline: time in which this process could not listen does not count.
             tick = timeout / _TICKS_PER_TIMEOUT
-            self._timer = self.wall_timer(tick, partial(self._on_tick, tick))
+            self._timers.append(self.wall_timer(tick, partial(self._on_tick, tick)))
+        self._repeat_timer = self.wall_timer(_REPEAT_SECONDS, self._repeat_goal)
+        self._timers.append(self._repeat_timer)
         self._forget()
 
     def teardown(self) -> None:
         """Stop counting."""
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
-            self._timer = None
+        while self._timers:
+            self.destroy_timer(self._timers.pop())
 
     def _forget(self) -> None:
         self._episode: EpisodeState | None = None
         self._episode_id = ""
         self._latest: tuple[int, SceneObjects, np.ndarray] | None = None
         self._published: list[tuple[Any, Any]] = []
+        self._unanswered: PoseStamped | None = None
         self._views.reset()
 
     def awaited(self) -> Awaited | None:
@@ -181,7 +187,7 @@ class AttentionPolicyNode(GraphNode):
         episode = self._episode or self._begin_episode(stamp)
         self._latest = (stamp, view["objects"], view["unexplained"])
         episode.add_view(stamp, view["pose"][:3, 3])
-        self._published = []
+        self._published, self._unanswered = [], None
         if unknown:
             # How many moves are left cannot be known.
             self._finish(episode, stamp, "attention_policy was started again, and earlier views are no longer kept")
@@ -196,6 +202,7 @@ class AttentionPolicyNode(GraphNode):
         episode, latest = self._episode, self._latest
         if episode is None or latest is None or status.stamp != latest[0]:
             return
+        self._unanswered = None
         if status.state == GoalState.REACHED:
             episode.reached()
         elif status.state == GoalState.REFUSED and episode.refused(status.reason):
@@ -213,8 +220,14 @@ class AttentionPolicyNode(GraphNode):
             self.get_logger().warning(f"the camera did not reach the goal within {timeout:g} s, another view is chosen")
             self._decide(episode, *latest)
 
+    def _repeat_goal(self) -> None:
+        """Publish a goal again that had no answer, unless its view is coming or no camera here answers goals."""
+        answers = self._active and self.count_publishers(topics.GOAL_STATUS.name) > 0
+        if self._unanswered is not None and answers and not self._views.under_way:
+            self.goal.publish(self._unanswered)
+
     def _decide(self, episode: EpisodeState, stamp: int, objects: SceneObjects, unexplained: np.ndarray) -> None:
-        self._published = []
+        self._published, self._unanswered = [], None
         decision, end = episode.decide(self.policy, objects, unexplained)
         if decision is not None:
             self._publish_attention(stamp, objects, decision)
@@ -222,7 +235,9 @@ class AttentionPolicyNode(GraphNode):
             self._finish(episode, stamp, end)
             return
         T_world_goal = self._budget.sphere.pose(decision.position)
-        self._publish(self.goal, transform_to_pose_stamped(T_world_goal, stamp, self.world_frame))
+        self._unanswered = transform_to_pose_stamped(T_world_goal, stamp, self.world_frame)
+        self._publish(self.goal, self._unanswered)
+        self._repeat_timer.reset()
 
     def _publish_attention(self, stamp: int, objects: SceneObjects, decision: Decision) -> None:
         centres = objects.T_world_object[:, :3, 3]

@@ -16,6 +16,7 @@ from active6d_core.camera import View
 from active6d_core.ros import topics
 from active6d_core.ros.conversions import (
     MessageError,
+    OutdatedError,
     camera_to_info,
     color_to_image,
     depth_to_image,
@@ -116,6 +117,7 @@ class CameraAdapterNode(GraphNode):
         self._pending: deque[tuple[int, Any, Any]] = deque(maxlen=_PENDING)
         self._infos: dict[str, Any] = {}
         self._goal_stamp: int | None = None
+        self._goal: PoseStamped | None = None
         self._begins, self._last_stamp, self._requests, self._unmatched, self._color_frame = True, -1, 0, 0, ""
 
     def awaited(self) -> Awaited:
@@ -208,7 +210,15 @@ class CameraAdapterNode(GraphNode):
 
     def _on_goal(self, message: PoseStamped) -> None:
         T_world_goal = pose_stamped_to_transform(message, self.world_frame)
-        self._goal_stamp = stamp_to_ns(message.header.stamp)
+        stamp = stamp_to_ns(message.header.stamp)
+        # A policy that sees no answer publishes its goal again.
+        if stamp and message == self._goal:
+            return
+        if 0 < stamp < self._last_stamp:
+            raise OutdatedError(
+                f"stale goal, decided at {stamp * 1e-9:.3f} s, now it is {self._last_stamp * 1e-9:.3f} s"
+            )
+        self._goal, self._goal_stamp = message, stamp
         self._pending.clear()
         self._gate.ask(T_world_goal)
         self._answer(GoalState.ACCEPTED)

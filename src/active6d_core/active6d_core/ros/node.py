@@ -106,7 +106,7 @@ class GraphNode(DiagnosticNode):
 
     def _take_from_one(self, topic: Topic, callback: Callable[[Any], None], message: Any) -> None:
         """Pass a message on, unless nodes of several graphs publish the topic: its origin would be unknown."""
-        if topic.publisher and self.count_publishers(topic.name) > 1:
+        if topic.publisher and not topic.shared and self.count_publishers(topic.name) > 1:
             names = live_publishers(self, topic.name)
             if len(names) > 1:
                 raise MessageError(

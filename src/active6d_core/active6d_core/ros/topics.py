@@ -35,6 +35,7 @@ class Topic:
         publisher: the node that publishes it; ``camera`` stands for any camera, empty for every node.
         transient_local: late-joining subscribers get the last messages.
         depth: of the queue of the publisher, and of the subscribers.
+        shared: nodes beside the publisher may publish it, too.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Topic:
     publisher: str
     transient_local: bool = True
     depth: int = 10
+    shared: bool = False
 
     @property
     def message_type(self) -> Any:
@@ -82,7 +84,8 @@ OBJECTS_MARKERS = Topic("objects/markers", "visualization_msgs/msg/MarkerArray",
 UNEXPLAINED = Topic("objects/unexplained", _TABLE, Per.VIEW, _FUSION)
 ATTENTION = Topic("attention", _TABLE, Per.MOVE, _POLICY, transient_local=False)
 VIEW_GOAL = Topic("view_goal", _POSE, Per.MOVE, _POLICY, transient_local=False)
-GOAL_STATUS = Topic("view_goal/status", _STATUS, Per.WHENEVER, _CAMERA)
+# An arm's node refuses what it cannot plan.
+GOAL_STATUS = Topic("view_goal/status", _STATUS, Per.WHENEVER, _CAMERA, shared=True)
 EPISODE_END = Topic("episode/end", _STATUS, Per.EPISODE, _POLICY)
 DIAGNOSTICS = Topic("/diagnostics", _STATUS, Per.WHENEVER, "", transient_local=False, depth=100)
 

@@ -51,6 +51,7 @@ class MovingCameraNode(GraphNode):
         self.declare("camera_speed", 0.25, "speed of the camera in metres per second of simulated time", minimum=1e-3)
         self.declare("radius", 0.8, "radius of the hemisphere of views in metres", minimum=0.1)
         self._stamp, self._episode = 0, ""
+        self._goal: PoseStamped | None = None
         self._clock_output = ClockOutput(self)
         self._color = self.output(topics.CAMERA_COLOR)
         self._depth = self.output(topics.CAMERA_DEPTH)
@@ -156,6 +157,10 @@ class MovingCameraNode(GraphNode):
 
     def _on_goal(self, message: PoseStamped) -> None:
         stamp = stamp_to_ns(message.header.stamp)
+        # A policy that sees no answer publishes its goal again. A second refusal would count for the next goal.
+        if stamp and message == self._goal:
+            return
+        self._goal = message
         try:
             T_world_camera = self._admit(message)
             self._answer(stamp, GoalState.ACCEPTED)
