@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -81,6 +82,27 @@ def test_analysis_scores_every_step():
     ]
     assert analysis.steps[0].attended.index == 2
     assert analysis.steps[-1].attended is None
+
+
+def test_confirmed_objects_and_the_wrong_ones_among_them_are_counted():
+    """By their probability, at every step; the page and the summary say how many are wrong."""
+    record = make_record()
+    steps = []
+    for step in record.steps:
+        probability = np.array([0.9, *np.zeros(len(step.objects) - 2), 0.5])
+        steps.append(replace(step, objects=replace(step.objects, probability=probability)))
+    analysis = analyse(replace(record, steps=steps))
+    for step, row in zip(analysis.steps, analysis.summary()["steps"], strict=True):
+        assert [each.index for each in step.confirmed] == [0, len(step.rows) - 1]
+        # The last object of every step is none of the true ones.
+        expected = 1 + (not step.rows[0].detected)
+        assert (step.wrong, row["confirmed"], row["wrong"]) == (expected, 2, expected)
+    page = Page(render_html(analysis)).text
+    assert f"confirmed 2, {analysis.steps[-1].wrong} wrong" in page
+    assert "90 %" in page
+    bare = analyse(replace(record, steps=steps, ground_truth=None))
+    assert bare.steps[-1].wrong is None
+    assert "confirmed 2 attends" in Page(render_html(bare)).text
 
 
 def test_analysis_takes_the_median_time_of_each_node():

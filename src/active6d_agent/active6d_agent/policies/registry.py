@@ -73,8 +73,9 @@ class Decision:
     Attributes:
         position: (3,) goal on the sphere in the world, metres; the current position when stopping.
         view: index of the goal in the grid, None when it lies off the grid or the episode stops.
-        attention: (n,) weight of each object, summing to one (for n > 0).
-        attended: index of the object that the move is for, None when the policy attends to no single object.
+        attention: (n,) weight of each object. They sum to at most one; what is missing is the weight of objects that
+            have no hypothesis yet.
+        attended: index of the object that the move is for, None when it is for no single object of these.
         stop: end the episode here instead of moving.
     """
 
@@ -140,6 +141,7 @@ _registry: Registry[Policy] = Registry(
     {
         **dict.fromkeys(_BASELINES, "active6d_agent.policies.baselines"),
         "attention": "active6d_agent.policies.attention.network",
+        "information-gain": "active6d_agent.policies.view_attention.information_gain",
         "view-attention": "active6d_agent.policies.view_attention.network",
         "sb3": "active6d_agent.policies.sb3",
     },

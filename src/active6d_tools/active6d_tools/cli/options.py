@@ -76,8 +76,8 @@ Imports = Annotated[
 
 #: In the order of the table that ``active6d evaluate`` prints.
 ALL_POLICIES = (
-    *("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score", "attention"),
-    *("view-attention", "oracle", "all-views"),
+    *("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score", "information-gain"),
+    *("attention", "view-attention", "oracle", "all-views"),
 )
 
 #: Policies that ``active6d train policy`` trains.

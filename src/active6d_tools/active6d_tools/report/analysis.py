@@ -10,6 +10,7 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.metrics import DETECTION_FRACTION, SceneScore, evaluate_scene
 from active6d_core.object_model import ObjectModel, list_objects, load_object
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.scene.fusion import FusionParameters
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,7 @@ class ObjectRow:
     index: int
     verification: float
     score: float
+    probability: float
     support: int
     spread_mm: float
     attention: float | None
@@ -57,6 +59,16 @@ class StepAnalysis:
     def hypothesis_count(self) -> int:
         """Number of hypotheses of the estimator in this view."""
         return len(self.record.hypotheses) if self.record.hypotheses is not None else 0
+
+    @property
+    def confirmed(self) -> list[ObjectRow]:
+        """The objects that are more probably right than not."""
+        return [row for row in self.rows if row.probability >= FusionParameters.confirmed]
+
+    @property
+    def wrong(self) -> int | None:
+        """How many confirmed objects are no true object's detection, None without ground truth."""
+        return None if self.truth is None else sum(not row.detected for row in self.confirmed)
 
     @property
     def attended(self) -> ObjectRow | None:
@@ -121,6 +133,8 @@ class EpisodeAnalysis:
                     "moved_m": step.moved_m,
                     "hypotheses": step.hypothesis_count,
                     "objects": len(step.rows),
+                    "confirmed": len(step.confirmed),
+                    "wrong": step.wrong,
                     "detection_rate": step.truth.detection_rate if step.truth else None,
                     "e_add_mm": step.truth.mean_e_add_mm if step.truth else None,
                 }
@@ -186,6 +200,7 @@ def _rows(step: RecordedStep, objects: SceneObjects, truth: SceneScore | None) -
             index=i,
             verification=float(objects.verification[i]),
             score=float(objects.score[i]),
+            probability=float(objects.probability[i]),
             support=int(objects.support[i]),
             spread_mm=1e3 * float(objects.spread[i]),
             attention=None if attention is None else float(attention[i]),

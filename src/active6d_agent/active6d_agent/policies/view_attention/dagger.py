@@ -8,7 +8,7 @@ learner visits itself, with some random moves and with budgets of every length.
 import json
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -23,7 +23,7 @@ from active6d_agent.environment.rollout import MEASURES, Choose, measure, roll_o
 from active6d_agent.evaluation.oracle import known
 from active6d_agent.evaluation.policy_evaluation import all_starts, run_named
 from active6d_agent.policies.registry import MAX_OBJECTS, Observation
-from active6d_agent.policies.view_attention.features import SceneState, gather, represent
+from active6d_agent.policies.view_attention.features import BELIEF, INFORMATION, SceneState, gather, represent
 from active6d_agent.policies.view_attention.network import (
     GAINS,
     ViewAttention,
@@ -52,6 +52,14 @@ _LATER_WEIGHT = 0.1
 # Variance over a state's views, in objects squared, below which all states count the same.
 _VARIANCE_FLOOR = 0.1
 
+#: Columns of the network's inputs that are not used, by the value of ``inputs``.
+IGNORED: dict[str, dict[str, slice | int]] = {
+    "all": {},
+    "belief": {"pairs": INFORMATION},
+    "information": {"items": BELIEF},
+    "poses": {"items": BELIEF, "pairs": INFORMATION},
+}
+
 
 @dataclass(frozen=True)
 class DaggerParameters:
@@ -71,6 +79,9 @@ class DaggerParameters:
         starts: validation episodes.
         evaluate_every: rounds between validations.
         object_weight: of the loss of single objects, against that of a view's sum.
+        inputs: ``all``, or without what fusion knows of its certainty, to measure what that is worth: ``poses``
+            (neither probability, entropy nor expected information), ``belief`` (no expected information) or
+            ``information`` (neither probability nor entropy).
         hidden: width of the network.
         seed: of the weights, the episodes and the batches.
 
@@ -91,13 +102,16 @@ class DaggerParameters:
     starts: int = 300
     evaluate_every: int = 5
     object_weight: float = 1.0
+    inputs: str = "all"
     hidden: int = 32
     seed: int = 0
 
     def __post_init__(self) -> None:
         if not 0 <= self.explore <= 1:
             raise ValueError(f"training: explore must be in [0, 1], got {self.explore}")
-        for name in asdict(self).keys() - {"explore", "learning_rate", "object_weight", "seed"}:
+        if self.inputs not in IGNORED:
+            raise ValueError(f"training: inputs must be one of {', '.join(IGNORED)}, got '{self.inputs}'")
+        for name in asdict(self).keys() - {"explore", "learning_rate", "object_weight", "inputs", "seed"}:
             if getattr(self, name) < 1:
                 raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
         if not self.learning_rate > 0:
@@ -332,6 +346,7 @@ class _Learner:
         torch.manual_seed(parameters.seed)
         self.lookup, self.parameters, self._weighing = lookup, parameters, weighing
         self._trained = ViewAttention(parameters.hidden)
+        _ignore(self._trained, IGNORED[parameters.inputs])
         self.optimizer = torch.optim.Adam(self._trained.parameters(), parameters.learning_rate, weight_decay=1e-5)
         lowest = _LOWEST_RATE * parameters.learning_rate
         self._schedule = CosineAnnealingLR(self.optimizer, parameters.rounds, lowest)
@@ -404,7 +419,7 @@ class _Learner:
         drawn = [self.memory[i] for i in self.rng.integers(len(self.memory), size=self.parameters.batch)]
         some = self.rng.permutation(len(self.lookup.sphere))[: self.parameters.views]
         state = gather([example.state for example in drawn], some)
-        nows, laters = self._trained.explain(state)
+        nows, laters = self._trained(state)
         now = _labels([example.now for example in drawn], some, nows.shape[2])
         later = _labels([example.later for example in drawn], some, nows.shape[2])
         # The next view's gain decides more than later gains, and is less noisy.
@@ -416,6 +431,17 @@ class _Learner:
         self.optimizer.step()
         self._average.update_parameters(self._trained)
         return float(loss.detach())
+
+
+def _ignore(network: ViewAttention, inputs: Mapping[str, slice | int]) -> None:
+    """Set the weights of some inputs to zero and keep them there."""
+    layers = {"items": network.of_object[0], "pairs": network.of_pair}
+    for name, columns in inputs.items():
+        weight = cast(torch.Tensor, layers[name].weight)
+        kept = torch.ones_like(weight)
+        kept[:, columns] = 0.0
+        weight.data.mul_(kept)
+        weight.register_hook(kept.mul)
 
 
 def _running_mean(mean: torch.Tensor, value: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:

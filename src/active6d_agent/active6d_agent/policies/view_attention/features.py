@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+import scipy.stats
 import torch
 from scipy.spatial.distance import cdist
 
@@ -22,7 +23,9 @@ from active6d_perception.scene.expected_visibility import Tray, expected_visibil
 #: Clusters of unexplained surface beyond these are left out, the largest being kept.
 MAX_CLUSTERS = 8
 #: Number of features of an item, of an item and a view, and of a view, see :class:`SceneState` and :func:`gather`.
-ITEM_FEATURES, PAIR_FEATURES, VIEW_FEATURES = 18, 12, 8
+ITEM_FEATURES, PAIR_FEATURES, VIEW_FEATURES = 20, 13, 8
+#: Columns of the probability and the entropy among an item's features, and of the expected information among a pair's.
+BELIEF, INFORMATION = slice(18, 20), 12
 # Points within this fraction of the diameter are one cluster, and so many are needed.
 _CLUSTER_RADIUS = 0.45
 _FEWEST_POINTS = 4
@@ -48,9 +51,9 @@ class SceneState:
 
     Attributes:
         pose: (n, 3, 4) in the world; a cluster has the likely centre of its object, and zeros for a rotation.
-        scalars: (n, 7) verification score, estimator's score, spread in metres, share of the views that support the
+        scalars: (n, 9) verification score, estimator's score, spread in metres, share of the views that support the
             object; 1 for a cluster; unexplained surface near the centre and in a wider ball. Correct poses leave
-            little of it.
+            little of it. Then the probability that the pose is right, and the entropy of the belief there in nats.
         shown: (n, M) share of the item's surface that each view of the grid would show past the objects in between.
         seen: (n, t) the same for the views taken.
         taken: (t, 3) positions of the camera, the current one last.
@@ -77,8 +80,8 @@ class SceneState:
 
     @cached_property
     def items(self) -> np.ndarray:
-        """(n, 18) float32, features of each item; of the world's directions only the vertical counts."""
-        verification, score, spread, *rest = self.scalars.T
+        """(n, 20) float32, features of each item; of the world's directions only the vertical counts."""
+        verification, score, spread, *rest, probability, entropy = self.scalars.T
         centre, upright = self.pose[:, :, 3], self.pose[:, 2, :3]
         apart = (centre - centre[:, None]) / self.diameter
         near = np.exp(-(apart**2).sum(axis=-1))
@@ -97,8 +100,21 @@ class SceneState:
             self.seen.sum(axis=1) / 3,
             moves,
             *_sides(upright, self.axis).T,
+            probability,
+            entropy,
         ]
         return np.stack(columns, axis=1).astype(np.float32)
+
+    @cached_property
+    def uncertainty(self) -> np.ndarray:
+        """(n,) float32, entropy in nats of what is not known of each item.
+
+        Of an object it is the entropy of "right or wrong" and of the belief over the poses at its place. Of a cluster
+        of unexplained surface it is that of a toss: an object is there or not.
+        """
+        probability, entropy = self.scalars[:, 7], self.scalars[:, 8]
+        right = scipy.stats.entropy(np.stack([probability, 1 - probability]))
+        return np.where(self.scalars[:, 4] > 0, np.log(2), right + entropy).astype(np.float32)
 
     @cached_property
     def outlooks(self) -> np.ndarray:
@@ -192,12 +208,13 @@ def represent(observation: Observation, model: ObjectModel, tray: Tray | None = 
     grid = observation.sphere.positions
     eyes = np.concatenate([grid, observation.positions])
     shares = expected_visibility(model).shares(T_world_item, eyes, tray or Tray.for_model(model), hiding=n)
-    pose, scalars = T_world_item[:, :3].astype(np.float32), np.zeros((n + m, 7), np.float32)
+    pose, scalars = T_world_item[:, :3].astype(np.float32), np.zeros((n + m, 9), np.float32)
     pose[n:, :, :3] = 0.0
     axis = np.zeros(3) if model.symmetry.axis is None else model.symmetry.axis
     columns = objects.verification, objects.score, objects.spread, objects.support / t
     scalars[:n, :4] = np.column_stack(columns)[best]
     scalars[n:, 4] = 1.0
+    scalars[:n, 7:] = np.column_stack([objects.probability, objects.entropy])[best]
     apart = cdist(T_world_item[:, :3, 3], unexplained)
     for column, within in enumerate(_NEAR_CENTRE, start=5):
         scalars[:, column] = (apart < within * model.diameter).sum(axis=1) / _POINTS_OF_ONE
@@ -222,14 +239,15 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
         views: (M,) indices of the views to describe, all of the grid when None.
 
     Returns:
-        ``items`` (B, n, 18) and ``outlooks`` (B, M, 8) of the states. ``present`` (B, n), which items are no padding.
-        ``more`` (B,), whether moves are left after the next. ``pairs`` (B, M, n, 12), features of each item and view.
+        ``items`` (B, n, 20) and ``outlooks`` (B, M, 8) of the states. ``present`` (B, n), which items are no padding.
+        ``more`` (B,), whether moves are left after the next. ``pairs`` (B, M, n, 13), features of each item and view.
 
-        These 12 are the share of the item that the view would show, and how much more that is than the views taken have
+        These 13 are the share of the item that the view would show, and how much more that is than the views taken have
         shown. Then how steeply the view looks down, the angle to the nearest view taken, seen from the item, and its
         cosine. Then how much the views taken have seen from that side, the distance, and whether the view is on the
         item's side of the bin. Then how far the item is from the image's centre, and the direction to the view in the
-        object's frame (3).
+        object's frame (3). Last, how much the view is expected to tell of the item, in nats: its uncertainty, times the
+        share that the view would show, times the share that the views taken have not seen from that side.
     """
     count = max(1, *(len(each.pose) for each in states))
     some = slice(None) if views is None else views
@@ -247,7 +265,8 @@ def gather(states: Sequence[SceneState], views: np.ndarray | None = None) -> dic
         arrays["items"][row, :n], arrays["present"][row, :n] = each.items, True
         shown = np.ascontiguousarray(each.shown[:, some])
         _pair(each.pose, shown, each.seen, each.taken, grid, arrays["pairs"][row])
-    arrays["pairs"][..., -3:] = _sides(arrays["pairs"][..., -3:], states[0].axis)
+        arrays["pairs"][row, :, :n, INFORMATION] = each.uncertainty * shown.T * (1 - arrays["pairs"][row, :, :n, 5])
+    arrays["pairs"][..., 9:12] = _sides(arrays["pairs"][..., 9:12], states[0].axis)
     return {name: torch.from_numpy(values) for name, values in arrays.items()}
 
 

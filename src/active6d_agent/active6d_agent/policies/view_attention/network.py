@@ -71,12 +71,8 @@ class _Seen(NamedTuple):
 
     pairs: torch.Tensor
     """(B, M, n, hidden), padding included"""
-    total: torch.Tensor
-    """(B, M, hidden) sum over the items"""
     whole: torch.Tensor
     """(B, M, 3 hidden + 8) the attended, the mean, and the features of the view"""
-    attention: torch.Tensor
-    """(B, M, n)"""
     mask: torch.Tensor
     """(B, n) 1 for an item, 0 for padding"""
 
@@ -104,28 +100,15 @@ class ViewAttention(nn.Module):
             nn.Linear(3 * hidden + VIEW_FEATURES, hidden), nn.ReLU(), nn.Linear(hidden, 2 * GAINS)
         )
 
-    def forward(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def forward(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Value all views.
 
         Args:
             state: of :func:`~active6d_agent.policies.view_attention.features.gather`.
 
         Returns:
-            (B, M, 2) gains of going there next; (B, M, 2) gains of the moves after that, zero where none are left;
-            (B, M, n) each view's attention to the objects.
-        """
-        seen = self._look(state)
-        # Gains of items add up, each a linear function of its features, so the sum of the features suffices. Gains of
-        # objects without an item come from the view as a whole.
-        bias = (seen.mask.sum(dim=1, keepdim=True) * self.per_object.bias)[:, None]
-        gains = seen.total @ self.per_object.weight.T + bias + self.per_view(seen.whole)
-        return gains[..., :GAINS], gains[..., GAINS:] * state["more"][:, None, None], seen.attention
-
-    def explain(self, state: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """The terms that :meth:`forward` sums, for training.
-
-        Twice (B, M, n + 1, 2): gains of going there next and of the moves after that, of each item, and last of the
-        view as a whole.
+            Twice (B, M, n + 1, 2): gains of going there next, and of the moves after that, zero where none are left.
+            They are the terms of each item, and last those of objects without an item; a view gains their sum.
         """
         seen = self._look(state)
         own = self.per_object(seen.pairs) * seen.mask[:, None, :, None]
@@ -149,7 +132,7 @@ class ViewAttention(nn.Module):
         attention = torch.softmax(logits, dim=-1) * mask[:, None]
         attended, total = (torch.stack([attention, mask[:, None].expand_as(attention)], dim=2) @ e).unbind(dim=2)
         whole = torch.cat([attended, total / count[..., None], pooled[:, None].expand_as(total), views], dim=-1)
-        return _Seen(e, total, whole, attention, mask)
+        return _Seen(e, whole, mask)
 
 
 def save_network(
@@ -182,12 +165,13 @@ class ViewValues:
     Attributes:
         worth: (B, M) of going to each view next, ``-inf`` where it is not a candidate.
         gain: (B, M) expected of it and all later moves, ``-inf`` likewise.
-        attention: (B, M, n) of each view to the objects and clusters of unexplained surface.
+        share: (B, M, n + 1) each item's share of what a view and the moves after it are worth, not negative and
+            summing to one; last that of objects without an item. Zeros where a view is worth nothing.
     """
 
     worth: np.ndarray
     gain: np.ndarray
-    attention: np.ndarray
+    share: np.ndarray
 
 
 def value_views(
@@ -195,14 +179,18 @@ def value_views(
 ) -> ViewValues:
     """Value every view of every observation, given its features (:func:`.features.represent`)."""
     with torch.inference_mode():
-        now, later, attention = (values.double().numpy() for values in network(gather(states)))
+        now, later = (values.double().numpy() for values in network(gather(states)))
     candidates = np.stack([each.candidates() for each in observations])
     arcs = np.stack([each.sphere.arc(each.sphere.positions, each.positions[-1]) for each in observations])
     weigh = np.array([1.0, weighing.error_weight])
-    worth = (now + weighing.lookahead * later) @ weigh - weighing.metres_weight * arcs
+    terms = (now + weighing.lookahead * later) @ weigh
+    worth = terms.sum(axis=-1) - weighing.metres_weight * arcs
     # Views of equal value differ by rounding, which must not decide.
     worth = np.where(candidates, np.round(worth, 5), -np.inf)
-    return ViewValues(worth, np.where(candidates, (now + later) @ weigh, -np.inf), attention)
+    positive = np.maximum(terms, 0.0)
+    total = positive.sum(axis=-1, keepdims=True)
+    share = positive / np.where(total > 0, total, 1.0)
+    return ViewValues(worth, np.where(candidates, ((now + later) @ weigh).sum(axis=-1), -np.inf), share)
 
 
 def trace(network: ViewAttention, model: ObjectModel) -> nn.Module:
@@ -281,7 +269,7 @@ class ViewAttentionPolicy(DeterministicPolicy):
             raise ValueError(f"bin_width must be positive and wall_height not negative, got {self._tray}")
 
     def decide(self, observation: Observation) -> Decision:
-        """The view of highest worth, and the object that it attends to."""
+        """The view of highest worth. The attention is each object's share of it."""
         with _one_thread():
             state = represent(observation, self._model, self._tray)
             values = value_views(self._network, [observation], [state], self._weighing)
@@ -291,7 +279,8 @@ class ViewAttentionPolicy(DeterministicPolicy):
         view = int(values.worth[0].argmax())
         attention = np.zeros(len(observation.objects))
         best = best_verified(observation)
-        attention[best] = values.attention[0, view, : len(best)]
-        if not attention.any():  # all of it is on unexplained surface
-            return Decision.go_to(observation, view)
-        return Decision.go_to(observation, view, attention / attention.sum(), int(attention.argmax()))
+        share = values.share[0, view]
+        attention[best] = share[: len(best)]
+        # A move for what has no pose yet attends to no object.
+        attended = int(best[share.argmax()]) if share.argmax() < len(best) and share.any() else None
+        return Decision.go_to(observation, view, attention, attended)
