@@ -109,7 +109,7 @@ def test_a_recording_without_metadata_is_read_and_says_so(tmp_path):
     (folder / "metadata.yaml").unlink()
     record = read_episode(folder)
     assert len(record.steps) == 3
-    assert record.damage == ("there is no metadata.yaml, the recording was killed",)
+    assert record.damage == ("there is no metadata.yaml: the recording was killed, or its file was moved",)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """The adapter against a simulated driver with each trait that real ones have."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -184,7 +185,8 @@ def test_unregistered_depth_is_registered_by_the_parameter(graph):
             "depth_to_color": [-0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
         },
     )
-    cell = Cell(graph, traits, view=View(0, color.color, depth, CAMERA, POSES[0]))
+    apart = SimpleNamespace(color=color.color, depth=depth, camera=CAMERA, T_world_camera=POSES[0])
+    cell = Cell(graph, traits, view=apart)
     cell.first_view()
     found = image_to_depth(cell.depth[0])
     assert np.isfinite(found).mean() > 0.95

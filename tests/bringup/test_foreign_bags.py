@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from simulated_driver import plane_view
 
@@ -97,8 +97,11 @@ def type_of(message):
     return message.__msgtype__
 
 
-def write(path, messages, plugin=StoragePlugin.MCAP):
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
+def write(path, messages, plugin=StoragePlugin.MCAP, mode=None):
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
         connections = {}
         for arrival, topic, message in messages:
             kind = type_of(message)
@@ -318,14 +321,14 @@ def test_floating_point_millimetres_are_recognised(tmp_path):
             message = image(steps, "32FC1", stamp)
         messages.append((arrival, topic, message))
     bag = write(tmp_path / "bag", messages)
-    with pytest.raises(BagError, match=r"depth looks like millimetres .*set depth_scale to 0.001"):
+    with pytest.raises(BagError, match=r"depth looks like millimetres .*set --depth-scale to 0.001"):
         read_bag(bag)
     assert_views(bag, CameraOptions(depth_scale=1e-3))
 
 
 def test_a_bag_without_depth_names_what_it_holds(tmp_path):
     bag = write(tmp_path / "bag", [entry for entry in driver_messages() if entry[1] != DEPTH])
-    with pytest.raises(BagError, match=f"no depth images in it; it holds {INFO}, {COLOR}, {POSE}"):
+    with pytest.raises(BagError, match=rf"no depth images \(.*\) in it; it holds {INFO}, {COLOR} \(rgb8\), {POSE}"):
         read_bag(bag)
 
 
@@ -364,3 +367,174 @@ def test_repair_refuses_what_holds_nothing(tmp_path):
     with pytest.raises(BagError, match="not one message can be read"):
         repair(tmp_path / "empty", tmp_path / "saved")
     assert not (tmp_path / "saved").exists()
+
+
+def changed(topic, change):
+    """The driver's messages, those of one topic as ``change(message, stamp)`` makes them: (topic, message) or none."""
+    found = []
+    for arrival, name, message in driver_messages():
+        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+        found += [(arrival, *entry) for entry in (change(message, stamp) if name == topic else [(name, message)])]
+    return found
+
+
+def pixels(message):
+    return message.data.reshape(60, 80, 3)
+
+
+def bayer(message):
+    rows, columns = np.indices((60, 80)) % 2
+    return np.take_along_axis(pixels(message), (rows + columns)[..., None], axis=2)[..., 0]  # red above, blue below
+
+
+@pytest.mark.parametrize(
+    ("encoding", "make"),
+    [
+        ("bgr8", lambda message: pixels(message)[..., ::-1]),
+        ("8UC3", lambda message: pixels(message)[..., ::-1]),
+        ("rgb16", lambda message: pixels(message).astype(np.uint16) * 257),
+        (
+            "bgra16",
+            lambda message: np.dstack([pixels(message)[..., ::-1], pixels(message)[..., :1]]).astype("u2") * 257,
+        ),
+        ("bayer_rggb8", bayer),
+        ("bayer_rggb16", lambda message: bayer(message).astype(np.uint16) * 257),
+    ],
+)
+def test_colour_of_every_encoding_is_the_same(tmp_path, encoding, make):
+    bag = write(tmp_path / "bag", changed(COLOR, lambda m, stamp: [(COLOR, image(make(m), encoding, stamp))]))
+    assert_views(bag, color_tolerance=12 if "bayer" in encoding else 0)
+
+
+def test_grey_of_16_bits_beside_depth_is_colour(tmp_path):
+    def grey(message, stamp):
+        return [(COLOR, image((pixels(message).mean(axis=-1) * 16).astype(np.uint16), "mono16", stamp))]
+
+    bag = write(tmp_path / "bag", changed(COLOR, grey))
+    view = next(iter(read_episodes(read_bag(bag)))).steps[0].view
+    assert np.abs(view.color[..., 0].astype(float) - VIEWS[0].color.mean(axis=-1)).max() < 2
+
+
+def test_compressed_copies_beside_the_images_are_left_alone(tmp_path):
+    def both(message, stamp):
+        data = cv2.imencode(".jpg", pixels(message)[..., ::-1])[1].tobytes()
+        return [(COLOR, message), (f"{COLOR}/compressed", compressed(data, "rgb8; jpeg compressed bgr8", stamp))]
+
+    bag = write(tmp_path / "bag", changed(COLOR, both))
+    assert_views(bag)
+    index = read_bag(bag, CameraOptions.parse(f"color={COLOR}/compressed"))
+    assert index.source.startswith(f"color={COLOR}/compressed")
+
+
+def test_depth_in_a_png_that_says_no_more_is_recognised(tmp_path):
+    def png(message, stamp):
+        data = cv2.imencode(".png", message.data.view(np.uint16).reshape(60, 80))[1].tobytes()
+        return [(f"{DEPTH}/compressed", compressed(data, "png", stamp))]
+
+    assert_views(write(tmp_path / "bag", changed(DEPTH, png)))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_depth_of_its_own_camera_is_registered_by_the_static_transform(tmp_path, known):
+    own, frame = PinholeCamera(106, 60, 55.0, 55.0, 52.5, 29.5), "driver_depth_optical_frame"
+    T_color_depth = make_transform(np.eye(3), np.array([-0.05, 0.0, 0.0]))
+
+    def separate(message, stamp):
+        view = plane_view(own, VIEWS[(stamp - 100 * SECOND) // SECOND].T_world_camera @ T_color_depth)
+        depth = image(np.rint(view.depth * 1000).astype(np.uint16), "16UC1", stamp, frame)
+        K, P = own.matrix, np.hstack([own.matrix, np.zeros((3, 1))]).ravel()
+        calibration = replace(info(stamp, frame, width=106), k=K.ravel(), p=P)
+        return [("/driver/depth/image_raw", depth), ("/driver/depth/camera_info", calibration)]
+
+    messages = changed(DEPTH, separate)
+    if known:
+        static = TYPES["tf2_msgs/msg/TFMessage"]([transform(T_color_depth, 0, FRAME, frame)])
+        messages = [(1, "/tf_static", static), *messages]
+    bag = write(tmp_path / "bag", messages)
+    if not known:
+        with pytest.raises(BagError, match=r"depth is not registered.*no transform from .*: /tf_static is missing"):
+            read_bag(bag)
+        return
+    steps = read_episodes(read_bag(bag))[0].steps
+    for step, view in zip(steps, VIEWS, strict=True):
+        assert np.isfinite(step.view.depth).mean() > 0.95
+        assert np.nanmax(np.abs(step.view.depth / view.depth - 1.0)) < 0.05
+
+
+def test_without_static_transforms_the_cause_is_named(tmp_path):
+    message = TYPES["tf2_msgs/msg/TFMessage"]
+    messages = changed(POSE, lambda m, stamp: [("/tf", message([transform(np.eye(4), stamp, "base", "flange")]))])
+    with pytest.raises(BagError, match=f"no transform to {FRAME}, the frame of colour: /tf_static is missing"):
+        read_bag(write(tmp_path / "bag", messages))
+
+
+@pytest.mark.parametrize(
+    ("pose_at", "words"),
+    [
+        (lambda T: (T, 5000 * SECOND), "3 left out: the nearest camera pose is 4998 s away or more: are their stamps"),
+        (lambda T: (np.block([[T[:3, :3], 1000 * T[:3, 3:]], [T[3:]]]), 0), "is it in millimetres"),
+    ],
+)
+def test_poses_that_cannot_be_used_are_refused_with_their_cause(tmp_path, pose_at, words):
+    views = iter(VIEWS)
+
+    def other(message, stamp):
+        T, late = pose_at(next(views).T_world_camera)
+        return [(POSE, pose(T, stamp + late))]
+
+    with pytest.raises(BagError, match=words):
+        read_bag(write(tmp_path / "bag", changed(POSE, other)))
+
+
+def test_the_pose_of_the_cameras_body_is_noticed(tmp_path):
+    body = make_transform(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3))
+    views = iter(VIEWS)
+    messages = changed(POSE, lambda m, stamp: [(POSE, pose(next(views).T_world_camera @ body, stamp))])
+    assert any("not of its body" in note for note in read_bag(write(tmp_path / "bag", messages)).notes)
+
+
+def test_camera_info_that_is_not_finite_is_not_called_a_damaged_bag(tmp_path):
+    bag = write(tmp_path / "bag", changed(INFO, lambda m, stamp: [(INFO, replace(m, d=np.full(5, np.nan)))]))
+    with pytest.raises(BagError, match=r"no usable view .*d of camera_info holds a number that is not finite"):
+        read_bag(bag)
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_compressed_recordings_are_read_and_without_metadata_read_or_refused_with_the_cause(tmp_path, plugin, mode):
+    bag = write(tmp_path / "bag", driver_messages(), plugin, mode)
+    assert_views(bag)
+    (bag / "metadata.yaml").unlink()
+    if mode is CompressionMode.MESSAGE and plugin is StoragePlugin.SQLITE3:
+        assert_views(bag)
+    elif mode is CompressionMode.FILE:
+        for path in (bag, next(bag.glob("*.zstd"))):
+            with pytest.raises(BagError, match=r"compressed file.*zstd -d"):
+                read_bag(path)
+
+
+def test_a_cut_sqlite3_file_is_repaired(tmp_path):
+    bag = write(tmp_path / "bag", driver_messages(), StoragePlugin.SQLITE3)
+    file = next(bag.glob("*.db3"))
+    file.write_bytes(file.read_bytes()[: int(0.9 * file.stat().st_size)])
+    with pytest.raises(BagError, match="active6d bag repair"):
+        read_bag(bag)
+    saved = repair(bag, tmp_path / "saved")
+    assert 0 < saved.messages < 12
+    assert "ends early" in saved.damage[0]
+    assert summarise(tmp_path / "saved").messages == saved.messages
+
+
+def test_what_repair_cannot_do_is_said_by_the_reader_too(tmp_path):
+    (tmp_path / "cut.bag").write_bytes(b"#ROSBAG V2.0\nshort")
+    with pytest.raises(BagError, match="`rosbag reindex` of ROS 1"):
+        read_bag(tmp_path / "cut.bag")
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    with pytest.raises(BagError, match="the file is empty"):
+        read_bag(tmp_path / "empty.mcap")
+    bag = write(tmp_path / "bag", driver_messages(), StoragePlugin.SQLITE3)
+    next(bag.glob("*.db3")).unlink()
+    with pytest.raises(BagError, match="its files are missing; copy them back"):
+        read_bag(bag)
+    with pytest.raises(BagError, match=r"no .mcap or .db3 file"):
+        repair(bag, tmp_path / "saved")

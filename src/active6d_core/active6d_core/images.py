@@ -4,7 +4,7 @@ import io
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 #: Formats that are read. Pillow knows others, some of which run other programs.
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
@@ -29,8 +29,7 @@ def read_color(source: Path | bytes) -> np.ndarray:
             grey = np.asarray(image)
             if grey.min(initial=0) < 0 or grey.max(initial=0) >= 1 << 16:
                 raise ValueError(f"{_name(source)}: a grey image of more than 16 bits cannot be used as colours")
-            bits = next(bits for bits in _GREY_BITS if grey.max(initial=0) < 1 << bits)
-            return np.repeat((grey >> (bits - 8)).astype(np.uint8)[..., None], 3, axis=2)
+            return np.repeat(upper_bits(grey)[..., None], 3, axis=2)
         if image.mode == "F":
             raise ValueError(f"{_name(source)}: floating-point values cannot be used as colours; is it a depth image?")
         # Pillow would blend a transparent palette entry; the alpha channel is dropped instead.
@@ -51,6 +50,15 @@ def read_depth(source: Path | bytes) -> np.ndarray:
         return depth.astype(np.uint16) if image.mode.startswith("I;16") else depth
 
 
+def upper_bits(image: np.ndarray) -> np.ndarray:
+    """The upper eight bits of an integer image of at most 16 bits, as uint8.
+
+    Bits are counted from the smallest usual bit depth that holds the brightest pixel: cameras fill the low ones.
+    """
+    bits = next(bits for bits in _GREY_BITS if image.max(initial=0) < 1 << bits)
+    return (image >> (bits - 8)).astype(np.uint8)
+
+
 def _open(source: Path | bytes) -> Image.Image:
     try:
         image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=_FORMATS)
@@ -59,6 +67,8 @@ def _open(source: Path | bytes) -> Image.Image:
         image.load()
     except FileNotFoundError as error:
         raise ValueError(f"{_name(source)}: no such file") from error
+    except UnidentifiedImageError as error:
+        raise ValueError(f"{_name(source)}: not a readable image of the formats {', '.join(_FORMATS)}") from error
     # Pillow's decoders raise many kinds of errors on damaged files, including SyntaxError.
     except Exception as error:
         raise ValueError(f"{_name(source)}: not a readable image ({error})") from error

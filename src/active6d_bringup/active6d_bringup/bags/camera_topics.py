@@ -15,7 +15,25 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 #: What a user may name with ``--topics``; world is a frame.
 KEYS = ("color", "depth", "info", "depth_info", "pose", "world")
 _DEPTH_ENCODINGS = {"16UC1", "mono16", "32FC1", "64FC1"}
+_COPIES = ("/compressed", "/compressedDepth", "/theora", "/ffmpeg", "/zstd")
+_PNG, _PNG_DEPTH = b"\x89PNG", bytes([16, 0])  # 16 bits of grey
 _NAMES = {"color": CAMERA_COLOR.name, "depth": CAMERA_DEPTH.name, "info": CAMERA_INFO.name, "pose": CAMERA_POSE.name}
+
+
+#: Settings of ``camera_adapter``, which texts for both name, and the options that do the same for a recording.
+_OPTIONS = {
+    "set depth_info_topic and depth_to_color": "name --topics depth_info=NAME, with /tf_static in the recording",
+    "set info_topic to": "name --topics info=NAME,",
+    "(rectified)": "(--rectified)",
+    "depth_scale": "--depth-scale",
+}
+
+
+def with_options(text: str) -> str:
+    """A text that names settings of ``camera_adapter``, naming the command's options instead."""
+    for setting, option in _OPTIONS.items():
+        text = text.replace(setting, option)
+    return text
 
 
 @dataclass(frozen=True)
@@ -102,22 +120,25 @@ def find_camera(source: BagSource, options: CameraOptions) -> CameraTopics:
     images = [
         _image(topic, message) for topic, (kind, message) in first.items() if kind in IMAGES and message is not None
     ]
-    depths = [image for image in images if _is_depth(image)]
-    colors = [image for image in images if not _is_depth(image)]
     named = options.topics
+    images = _without_copies(images, set(named.values()))
+    depths = [image for image in images if _is_depth(image)]
+    # Of cameras, 16-bit grey is depth only where nothing else is.
+    depths = [image for image in depths if image.encoding != "mono16"] or depths
+    depths = [image for image in images if image.topic == named.get("depth")] or depths
+    colors = [image for image in images if image not in depths]
+    colors = [image for image in images if image.topic == named.get("color")] or colors
     depth = _choose(source, "depth", depths, named, lambda image: "align" in image.topic or "regist" in image.topic)
     color = _choose(source, "color", colors, named, lambda image: image.frame == depth.frame)
-    infos = [
-        _Candidate(topic, message.header.frame_id, Calibration.from_info(message).image_size)
-        for topic, (kind, message) in first.items()
-        if kind == INFO and message is not None
-    ]
+    infos = [_info(topic, message) for topic, (kind, message) in first.items() if kind == INFO and message is not None]
     depth_info = named.get("depth_info")
-    registered = depth_info is None and depth.frame == color.frame
+    same_size = None in (depth.size, color.size) or depth.size == color.size
+    registered = depth_info is None and depth.frame == color.frame and same_size
     fits = [info for info in infos if info.frame == color.frame] or infos
+    fits = [info for info in fits if info.size == color.size] or fits
     info = _choose(source, "info", fits, named, lambda each: _folder(each.topic) == _folder(color.topic))
     if not registered and depth_info is None:
-        own = [each for each in infos if each.frame == depth.frame]
+        own = [each for each in infos if each.frame == depth.frame and each.topic != info.topic]
         depth_info = own[0].topic if len(own) == 1 else None
     return CameraTopics(color.topic, depth.topic, info.topic, _pose(source, named), depth_info, named.get("world"))
 
@@ -151,12 +172,12 @@ def _choose(
         return found[0]
     if not candidates:
         kinds = {
-            "depth": "depth images",
+            "depth": f"depth images ({', '.join(sorted(_DEPTH_ENCODINGS))})",
             "color": "colour images",
             "info": "camera_info",
             "pose": "camera poses or /tf",
         }
-        there = ", ".join(sorted({each.topic for each in source.connections if each.msgcount})) or "nothing"
+        there = _contents(source)
         raise BagError(f"{source.path}: no {kinds[key]} in it; it holds {there}")
     usual = [each for each in candidates if each.topic.lstrip("/") == _NAMES.get(key)]
     for group in (candidates, usual, [each for each in candidates if prefer(each)]):
@@ -180,10 +201,40 @@ def _first_messages(source: BagSource) -> dict[str, tuple[str, Any]]:
     return first
 
 
+def _contents(source: BagSource) -> str:
+    """The topics with messages; those of images with their encoding."""
+    first = _first_messages(source)
+    encodings = {topic: _image(topic, message).encoding for topic, (kind, message) in first.items() if kind in IMAGES}
+    topics = sorted({each.topic for each in source.connections if each.msgcount})
+    return ", ".join(f"{each} ({encodings[each]})" if each in encodings else each for each in topics) or "nothing"
+
+
+def _without_copies(images: list[_Candidate], named: set[str]) -> list[_Candidate]:
+    """Without the compressed copies of images that are there uncompressed, unless they are named."""
+    raw = {image.topic for image in images}
+    return [
+        image
+        for image in images
+        if image.topic in named or not (image.topic.endswith(_COPIES) and _folder(image.topic) in raw - named)
+    ]
+
+
 def _image(topic: str, message: Any) -> _Candidate:
-    if hasattr(message, "format"):
-        return _Candidate(topic, message.header.frame_id, None, message.format)
-    return _Candidate(topic, message.header.frame_id, (message.width, message.height), message.encoding)
+    if not hasattr(message, "format"):
+        return _Candidate(topic, message.header.frame_id, (message.width, message.height), message.encoding)
+    encoding, header = message.format, bytes(message.data[:26])
+    # Some publishers only say "png"; the file itself says that it is 16-bit grey.
+    if header.startswith(_PNG) and header[24:26] == _PNG_DEPTH and not encoding.startswith(("16UC1", "mono16")):
+        encoding = f"16UC1; {encoding}"
+    return _Candidate(topic, message.header.frame_id, None, encoding)
+
+
+def _info(topic: str, message: Any) -> _Candidate:
+    try:
+        size = Calibration.from_info(message).image_size
+    except ValueError:  # said with the first view
+        size = None
+    return _Candidate(topic, message.header.frame_id, size)
 
 
 def _is_depth(image: _Candidate) -> bool:

@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.mcap_file import McapFile, RecordedMessage
 from active6d_bringup.bags.recorded_camera import import_camera
-from active6d_bringup.bags.source import BagError
+from active6d_bringup.bags.source import BagError, damaged
 from active6d_bringup.bags.writer import ACTIVE6D, CHECKSUM, INFORMATION, SETTINGS, TYPESTORE, file_number, stamp_of
 from active6d_core.calibration import Calibration
 from active6d_core.ros.conversions import COLOR_ENCODINGS
@@ -188,7 +188,7 @@ def _read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
     if not path.is_file():
         if not any(folder.glob("*.mcap")):
             raise BagError(f"{folder}: no metadata.yaml and no .mcap file; this is not a bag")
-        return {}, ["there is no metadata.yaml, the recording was killed"]
+        return {}, ["there is no metadata.yaml: the recording was killed, or its file was moved"]
     try:
         metadata = read_yaml(path)[INFORMATION]
         if not isinstance(metadata, dict):
@@ -235,7 +235,7 @@ def _read_with_rosbags(folder: Path) -> list[RecordedMessage]:
             ]
     # A damaged file fails anywhere in its decoding, with the error of whichever library was at work.
     except Exception as error:
-        raise BagError(f"{folder}: damaged bag ({error})") from error
+        raise damaged(folder, error) from error
 
 
 def topic_names(recorded: set[tuple[str, str]], folder: Path) -> dict[str, str] | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from active6d_bringup.bags.camera_topics import CameraOptions
+from active6d_bringup.bags.camera_topics import CameraOptions, with_options
 from active6d_bringup.bags.index import BagIndex, read_bag
 from active6d_bringup.bags.source import BagError
 from active6d_bringup.bags.writer import TYPESTORE
@@ -30,6 +30,7 @@ from active6d_core.ros.conversions import (
     points_from_cloud,
     pose_stamped_to_transform,
     poses_from_array,
+    refusing,
     stamp_to_ns,
 )
 from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, episode_info
@@ -202,21 +203,19 @@ def _episode(
 
 def _step(messages: dict[str, dict[int, Any]], latency_ms: dict[str, float], stamp: int, world: str) -> RecordedStep:
     at = {topic: by_stamp[stamp] for topic, by_stamp in messages.items() if stamp in by_stamp}
-    depth = at["camera/depth/image_raw"]
-    view = View(
-        stamp=stamp,
-        color=image_to_color(at["camera/color/image_raw"]),
-        depth=image_to_depth(depth),
-        camera=info_to_camera(at["camera/color/camera_info"]),
-        T_world_camera=pose_stamped_to_transform(at[CAMERA_POSE.name], world),
-    )
-    problem = check_depth_unit(view.depth, float(np.linalg.norm(view.T_world_camera[:3, 3])))
+    message = at["camera/depth/image_raw"]
+    depth = image_to_depth(message)
+    T_world_camera = pose_stamped_to_transform(at[CAMERA_POSE.name], world)
+    problem = check_depth_unit(depth, float(np.linalg.norm(T_world_camera[:3, 3])))
     if problem:
-        raise MessageError(f"view of {stamp * 1e-9:.3f} s: {problem}")
+        raise MessageError(f"view of {stamp * 1e-9:.3f} s: {with_options(problem)}")
+    with refusing():
+        color, camera = image_to_color(at["camera/color/image_raw"]), info_to_camera(at["camera/color/camera_info"])
+        view = View(stamp, color, depth, camera, T_world_camera)
     hypotheses = objects = unexplained = attention = attended = goal = None
     if "hypotheses" in at and "hypotheses/segmentation" in at:
         segmentation = image_to_segmentation(at["hypotheses/segmentation"])
-        hypotheses = hypotheses_from_cloud(at["hypotheses"], segmentation, depth.header.frame_id)
+        hypotheses = hypotheses_from_cloud(at["hypotheses"], segmentation, message.header.frame_id)
     if "objects" in at:
         objects = objects_from_cloud(at["objects"], world)
     if "objects/unexplained" in at:

@@ -2,7 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from active6d_bringup.bags.camera_topics import INFO, TRANSFORMS, CameraOptions, CameraTopics, find_camera
+from active6d_bringup.bags.camera_topics import INFO, TRANSFORMS, CameraOptions, CameraTopics, find_camera, with_options
 from active6d_bringup.bags.source import BagError, BagSource, open_source
 from active6d_bringup.bags.writer import TYPESTORE
 from active6d_bringup.camera.stream import SECOND, ArrivalGate, GateLimits, PoseHistory, Verdict, pose_difference
@@ -27,6 +27,7 @@ _TOLERANCE = 20_000_000
 _ARRIVAL_TOLERANCE = 200_000_000
 #: Images closer than this are a stream, of which one is taken wherever the camera stood.
 _STREAM_NS = SECOND // 2
+_STATIC = "/tf_static is missing, or in another file of the recording"
 _FRAMES = {"camera": "camera_optical_frame", "world": "world"}
 
 
@@ -85,6 +86,9 @@ def import_camera(path: Path, options: CameraOptions = CameraOptions()) -> Recor
         topics = find_camera(source, options)
         left_out: Counter[str] = Counter()
         scan = _scan(source, topics)
+        if topics.pose is None and topics.world is None and scan.tree.has(scan.color_frame):
+            world = "world" if scan.tree.has("world") else scan.tree.root(scan.color_frame)
+            topics = replace(topics, world=world)
         chosen = list(_choose_views(scan, topics, left_out))
         maker = ViewMaker(options.depth_scale, options.rectified)
         payloads: dict[str, dict[int, bytes]] = defaultdict(dict)
@@ -95,10 +99,11 @@ def import_camera(path: Path, options: CameraOptions = CameraOptions()) -> Recor
             for topic, payload in _messages(view).items():
                 payloads[topic][view.stamp] = payload
                 received[topic][view.stamp] = view.stamp
+    reasons_given = {with_options(reason): count for reason, count in left_out.items()}
     if not payloads:
-        reasons = "; ".join(f"{count} left out: {reason}" for reason, count in left_out.most_common(5))
+        reasons = "; ".join(f"{count} left out: {reason}" for reason, count in Counter(reasons_given).most_common(5))
         raise BagError(f"{path}: no usable view of {topics} ({reasons or 'no images'})")
-    return RecordedCamera(topics, dict(payloads), dict(received), dict(left_out), notes)
+    return RecordedCamera(topics, dict(payloads), dict(received), reasons_given, [with_options(note) for note in notes])
 
 
 def _scan(source: BagSource, topics: CameraTopics) -> _Scan:
@@ -107,7 +112,7 @@ def _scan(source: BagSource, topics: CameraTopics) -> _Scan:
     connections = [
         each
         for each in source.connections
-        if each.topic in wanted or (topics.pose is None and each.msgtype == TRANSFORMS)
+        if each.topic in wanted or (each.msgtype == TRANSFORMS and (topics.pose is None or topics.depth_info))
     ]
     stamps: dict[str, list[tuple[int, int]]] = {topics.color: [], topics.depth: []}
     frames: dict[str, str] = {}
@@ -156,19 +161,24 @@ def _unusable(stamps: list[int]) -> bool:
 def _choose_views(scan: _Scan, topics: CameraTopics, left_out: Counter[str]) -> Iterator[_Chosen]:
     """Pairs of images with a camera pose; of a stream, one for each place where the camera stood."""
     tolerance = _ARRIVAL_TOLERANCE if scan.by_arrival else _TOLERANCE
-    found = []
+    found, late = [], _Late()
     for stamp, position in scan.color:
         nearest = min(scan.depth, key=lambda entry: abs(entry[0] - stamp), default=None)
         if nearest is None or abs(nearest[0] - stamp) > tolerance:
-            late = "none" if nearest is None else f"the nearest is {abs(nearest[0] - stamp) * 1e-6:.0f} ms away"
-            left_out[f"no depth image within {tolerance * 1e-6:.0f} ms ({late})"] += 1
+            late.add("depth image", tolerance, None if nearest is None else abs(nearest[0] - stamp))
             continue
+        if topics.pose is not None:
+            pose = scan.poses.nearest(stamp)
+            if pose is None or abs(pose[0] - stamp) > 2 * tolerance:
+                late.add("camera pose", 2 * tolerance, None if pose is None else abs(pose[0] - stamp))
+                continue
         try:
             T = _camera_pose(scan, topics, stamp, 2 * tolerance)
         except MessageError as error:
             left_out[str(error)] += 1
             continue
         found.append(_Chosen(stamp, position, nearest[1], T))
+    left_out.update(late.reasons(len(scan.color)))
     gaps = np.diff([view.stamp for view in found])
     if len(gaps) and np.median(gaps) < _STREAM_NS:
         found = list(_stops(found, left_out))
@@ -177,13 +187,37 @@ def _choose_views(scan: _Scan, topics: CameraTopics, left_out: Counter[str]) -> 
 
 def _camera_pose(scan: _Scan, topics: CameraTopics, stamp: int, tolerance: int) -> np.ndarray:
     if topics.pose is None:
-        world = topics.world or ("world" if scan.tree.has("world") else scan.tree.root(scan.color_frame))
-        return scan.tree.lookup(world, scan.color_frame, stamp, tolerance)
+        if not scan.tree.has(scan.color_frame):
+            raise MessageError(f"no transform to {scan.color_frame}, the frame of colour: {_STATIC}")
+        return scan.tree.lookup(topics.world or "world", scan.color_frame, stamp, tolerance)
     nearest = scan.poses.nearest(stamp)
-    if nearest is None or abs(nearest[0] - stamp) > tolerance:
-        late = "none" if nearest is None else f"the nearest is {abs(nearest[0] - stamp) * 1e-6:.0f} ms away"
-        raise MessageError(f"no camera pose within {tolerance * 1e-6:.0f} ms ({late})")
+    assert nearest is not None, "only images with a pose get here"
     return nearest[1]
+
+
+class _Late:
+    """Counts what was not there in time, by its kind, with how late it was."""
+
+    def __init__(self) -> None:
+        self._nearest: dict[tuple[str, int], list[int | None]] = defaultdict(list)
+
+    def add(self, what: str, tolerance: int, nearest: int | None) -> None:
+        """The nearest is this far away, or there is none; all in nanoseconds."""
+        self._nearest[what, tolerance].append(nearest)
+
+    def reasons(self, images: int) -> Counter[str]:
+        """Reason in words to number of images, of ``images`` in all."""
+        found: Counter[str] = Counter()
+        for (what, tolerance), every in self._nearest.items():
+            known = sorted(each for each in every if each is not None)
+            if not known:
+                text = f"no {what}"
+            elif known[0] > SECOND and len(every) == images:
+                text = f"the nearest {what} is {known[0] * 1e-9:.0f} s away or more: are their stamps of one clock?"
+            else:
+                text = f"no {what} within {tolerance * 1e-6:.0f} ms (the nearest is {known[0] * 1e-6:.0f} ms away)"
+            found[text] += len(every)
+        return found
 
 
 def _stops(views: list[_Chosen], left_out: Counter[str]) -> Iterator[_Chosen]:
@@ -244,7 +278,10 @@ def _make(topics: CameraTopics, scan: _Scan, view: _Chosen, color: Any, depth: A
     depth_info = _latest(scan.depth_infos, arrival) if scan.depth_infos else None
     T_color_depth = None
     if depth_info is not None:
-        T_color_depth = scan.tree.lookup(scan.color_frame, scan.depth_frame, view.stamp, 2 * _TOLERANCE)
+        try:
+            T_color_depth = scan.tree.lookup(scan.color_frame, scan.depth_frame, view.stamp, 2 * _TOLERANCE)
+        except MessageError as error:
+            raise MessageError(f"depth is not registered to colour, and there is {error}: {_STATIC}") from error
     return maker.make(view.stamp, color, depth, info, view.T_world_camera, depth_info, T_color_depth)
 
 

@@ -1,6 +1,8 @@
 """What can be saved of a damaged recording, as a bag with metadata and index."""
 
 import shutil
+import sqlite3
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +12,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from active6d_bringup.bags.mcap_file import McapFile, RecordedMessage
 from active6d_bringup.bags.source import BagError, find_files, open_source
 from active6d_bringup.bags.writer import TYPESTORE, file_number
+
+_SQLITE, _SQLITE_HEADER = b"SQLite format 3", 100
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,10 @@ def repair(path: Path, into: Path) -> Repaired:
     # Metadata of a killed recording is missing or wrong: the files themselves are read.
     files = sorted(path.glob("*.mcap"), key=file_number) or sorted(path.glob("*.db3")) if path.is_dir() else []
     files = files or find_files(path)
+    if files[0].suffix == ".bag":
+        raise BagError(f"{path}: repair is for .mcap and .db3; `rosbag reindex` of ROS 1 repairs this bag")
     if files[0].suffix not in (".mcap", ".db3"):
-        raise BagError(f"{path}: a ROS 1 bag is read as it is; repair is for .mcap and .db3")
+        raise BagError(f"{path}: no .mcap or .db3 file in it; decompress .zstd files first, with `zstd -d FILE`")
     damage: list[str] = []
     count = _write(into, (message for file in files for message in _messages(file, damage)), damage)
     if not count:
@@ -61,8 +67,32 @@ def _messages(file: Path, damage: list[str]) -> Iterator[RecordedMessage]:
         with open_source(file) as source:
             for connection, received, payload in source.messages(source.connections):
                 yield RecordedMessage(connection.topic, connection.msgtype, received, payload)
-    except BagError as error:
-        damage.append(str(error))
+    except BagError:
+        yield from _rows(file, damage)
+
+
+def _rows(file: Path, damage: list[str]) -> Iterator[RecordedMessage]:
+    """The messages of a cut sqlite3 file, as far as it goes."""
+    with tempfile.TemporaryDirectory() as folder:
+        # SQLite opens no file that is shorter than its header says.
+        whole, header = Path(folder) / file.name, file.read_bytes()[:_SQLITE_HEADER]
+        shutil.copyfile(file, whole)
+        if header.startswith(_SQLITE):
+            page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
+            with whole.open("r+b") as copy:
+                copy.truncate(max(page * pages, file.stat().st_size))
+        database = sqlite3.connect(f"{whole.as_uri()}?immutable=1", uri=True)
+        try:
+            topics = {key: (name, kind) for key, name, kind in database.execute("SELECT id, name, type FROM topics")}
+            for key, received, payload in database.execute(
+                "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
+            ):
+                if key in topics:
+                    yield RecordedMessage(*topics[key], received, payload)
+        except sqlite3.Error as error:
+            damage.append(f"{file.name} ends early or is damaged ({error})")
+        finally:
+            database.close()
 
 
 def _write(into: Path, messages: Iterator[RecordedMessage], damage: list[str]) -> int:

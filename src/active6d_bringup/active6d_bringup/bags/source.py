@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import zstandard
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys.store import Typestore
@@ -12,6 +13,10 @@ from rosbags.typesys.store import Typestore
 from active6d_bringup.bags.writer import TYPESTORE, stamp_of
 
 _FILES = (".mcap", ".db3", ".bag")
+_PACKED = (".mcap.zstd", ".db3.zstd")
+#: How Zstandard's frames begin, and no message of ROS 2 does.
+_ZSTANDARD = b"\x28\xb5\x2f\xfd"
+_LARGEST_MESSAGE = 2**28
 
 
 class BagError(ValueError):
@@ -38,8 +43,12 @@ class BagSource:
 
     def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
         """Connection, time of recording (ns) and serialized message, in order of recording."""
-        if connections:
-            yield from self._reader.messages(connections)
+        if not connections:
+            return
+        for connection, received, payload in self._reader.messages(connections):
+            if self._reader.is2 and payload[:4] == _ZSTANDARD:  # without metadata nobody says that messages are packed
+                payload = zstandard.ZstdDecompressor().decompress(payload, max_output_size=_LARGEST_MESSAGE)
+            yield connection, received, payload
 
     def stamp_of(self, message_type: str, payload: bytes) -> int:
         """Stamp (ns) of the header that a serialized message begins with."""
@@ -68,8 +77,20 @@ def open_source(path: Path) -> Iterator[BagSource]:
         raise
     # A damaged file fails anywhere in its decoding, with the error of whichever library was at work.
     except Exception as error:
-        advice = f"`active6d bag repair {path} NEW_FOLDER` saves what is there"
-        raise BagError(f"{path}: damaged bag, or its recording was killed ({error}); {advice}") from error
+        raise damaged(path, error) from error
+
+
+def damaged(path: Path, error: Exception) -> BagError:
+    """The error for a recording that cannot be read to its end, with what can be done."""
+    files = [path] if path.is_file() else [each for each in path.iterdir() if each.suffix in _FILES]
+    if files and not any(file.stat().st_size for file in files):
+        return BagError(f"{path}: the file is empty")
+    if not files:
+        return BagError(f"{path}: its files are missing; copy them back into the folder ({error})")
+    advice = f"`active6d bag repair {path} NEW_FOLDER` saves what is there"
+    if any(file.suffix == ".bag" for file in files):
+        advice = "`rosbag reindex` of ROS 1 saves what is there"
+    return BagError(f"{path}: damaged bag, or its recording was killed ({error}); {advice}")
 
 
 def find_files(path: Path) -> list[Path]:
@@ -79,6 +100,8 @@ def find_files(path: Path) -> list[Path]:
         BagError: nothing to read there.
     """
     if path.is_file():
+        if path.name.endswith(_PACKED):
+            raise BagError(f"{path}: a compressed file; name its folder with metadata.yaml, or run `zstd -d {path}`")
         if path.suffix not in _FILES:
             raise BagError(f"{path}: not a bag; bags end in {', '.join(_FILES)} or are folders")
         return [path]
@@ -90,4 +113,6 @@ def find_files(path: Path) -> list[Path]:
         found = sorted(path.glob(f"*{ending}"))
         if found:
             return found
+    if any(each.name.endswith(_PACKED) for each in path.iterdir()):
+        raise BagError(f"{path}: compressed files without metadata.yaml; run `zstd -d {path}/*.zstd` first")
     raise BagError(f"{path}: no metadata.yaml and no file ending in {', '.join(_FILES)}; this is not a bag")

@@ -6,8 +6,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from active6d_core.images import read_color, read_depth
-from active6d_core.ros.conversions import MessageError, image_to_color, image_to_pixels
+from active6d_core.images import read_color, read_depth, upper_bits
+from active6d_core.ros.conversions import COLOR_ENCODINGS, MessageError, image_to_color, image_to_pixels
 
 #: ROS encoding to channels and OpenCV's conversion to RGB, None for none.
 _CONVERSIONS = {
@@ -24,6 +24,18 @@ _CONVERSIONS = {
     "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
 }
+#: The same for 16 bits a channel, of which the upper ones are kept.
+_CONVERSIONS_16 = {
+    "mono16": (1, cv2.COLOR_GRAY2RGB),
+    "rgb16": (3, None),
+    "bgr16": (3, cv2.COLOR_BGR2RGB),
+    "rgba16": (4, cv2.COLOR_RGBA2RGB),
+    "bgra16": (4, cv2.COLOR_BGRA2RGB),
+    "bayer_rggb16": (1, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr16": (1, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg16": (1, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg16": (1, cv2.COLOR_BayerGB2RGB),
+}
 _DEPTH_TYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "64FC1": "f8"}
 _PNG = b"\x89PNG"
 _HEADER = struct.Struct("<iff")
@@ -37,11 +49,18 @@ def decode_color(message: Any) -> np.ndarray:
         MessageError: an encoding without a clear meaning, or damaged data.
     """
     if hasattr(message, "format"):
-        return _refused_as_message(lambda: read_color(bytes(message.data)))
-    if message.encoding not in _CONVERSIONS:
+        return _refused_as_message(lambda: read_color(bytes(message.data)), message.format)
+    if message.encoding in COLOR_ENCODINGS:
         return image_to_color(message)
-    channels, conversion = _CONVERSIONS[message.encoding]
-    return cv2.cvtColor(image_to_pixels(message, np.dtype("u1"), channels), conversion)
+    sixteen = message.encoding in _CONVERSIONS_16
+    if not sixteen and message.encoding not in _CONVERSIONS:
+        usable = ", ".join([*COLOR_ENCODINGS, *_CONVERSIONS, *_CONVERSIONS_16])
+        raise MessageError(f"colour encoding '{message.encoding}' is not one of {usable}")
+    channels, conversion = (_CONVERSIONS_16 if sixteen else _CONVERSIONS)[message.encoding]
+    pixels = image_to_pixels(message, np.dtype("u2" if sixteen else "u1"), channels)
+    if sixteen:
+        pixels = upper_bits(pixels)
+    return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
 
 
 def decode_depth(message: Any, scale: float = 0.0) -> np.ndarray:
@@ -73,7 +92,7 @@ def _decode_compressed_depth(message: Any) -> np.ndarray:
         raise MessageError(
             f"depth of format '{text}' is not a PNG image; set the driver's compressedDepth.format to png"
         )
-    values = _refused_as_message(lambda: read_depth(data[start:]))
+    values = _refused_as_message(lambda: read_depth(data[start:]), text)
     if not text.startswith("32FC1") or start != _HEADER.size:
         return values
     # compressed_depth_image_transport stores floating-point depth as quantised inverse depth: a / (value - b).
@@ -84,8 +103,8 @@ def _decode_compressed_depth(message: Any) -> np.ndarray:
         return np.where(values > 0, a / (values - np.float32(b)), np.nan).astype(np.float32)
 
 
-def _refused_as_message(decode: Any) -> np.ndarray:
+def _refused_as_message(decode: Any, text: str) -> np.ndarray:
     try:
         return decode()
     except ValueError as error:
-        raise MessageError(str(error)) from error
+        raise MessageError(f"image of format '{text}' cannot be read: {error}") from error

@@ -8,6 +8,8 @@ from active6d_core.calibration import Calibration
 #: The median depth of a bin cannot be further from the camera's distance to it than this factor.
 _SCALE_FACTOR = 3.0
 _FARTHEST_CAMERA = 20.0
+#: Cosine of the angle between the camera's axis and the way to the bin, below which it looks past the bin.
+_TOWARDS_BIN = 0.5
 
 
 def check_depth_unit(depth: np.ndarray, distance: float | None = None) -> str:
@@ -30,7 +32,10 @@ def check_depth_unit(depth: np.ndarray, distance: float | None = None) -> str:
         return f"depth looks like millimetres that are read as metres ({measured}): set depth_scale to 0.001"
     for unit in (0.1, 0.01, 10.0):
         if low <= median * unit <= high:
-            return f"depth is {1 / unit:g} times what it can be ({measured}): multiply depth_scale by {unit:g}"
+            return (
+                f"depth is {1 / unit:g} times what it can be ({measured}): multiply depth_scale by {unit:g} (unset, it "
+                "is 0.001 for integers)"
+            )
     return f"depth cannot be metres ({measured}): set depth_scale, or the pose is not the camera's"
 
 
@@ -95,14 +100,21 @@ def check_pose(T_world_camera: np.ndarray) -> str:
     """Whether a camera pose can be one in front of a bin; empty if so."""
     position = T_world_camera[:3, 3]
     distance = float(np.linalg.norm(position))
-    if distance > _FARTHEST_CAMERA:
-        return f"the camera's pose is {distance:.0f} m from the world's origin: is it in millimetres?"
     if position[2] <= 0:
         return (
             f"the camera is {-position[2]:.2f} m below the bin: world's z must point up, its origin is the bin's centre"
         )
-    if T_world_camera[:3, 2] @ position > 0:
+    if T_world_camera[:3, 2] @ position > -_TOWARDS_BIN * distance:
         return (
-            "the camera looks away from the bin: is the pose that of the optical frame (z forward), and world the bin?"
+            "the camera looks past the bin: is the pose that of the optical frame (z forward), not of its body (x "
+            "forward), and world's origin the bin?"
         )
     return ""
+
+
+def check_distance(T_world_camera: np.ndarray) -> str:
+    """Whether the camera is near enough to the bin for its position to be metres; empty if so."""
+    distance = float(np.linalg.norm(T_world_camera[:3, 3]))
+    if distance <= _FARTHEST_CAMERA:
+        return ""
+    return f"the camera's pose is {distance:.0f} m from the world's origin: is it in millimetres?"

@@ -6,7 +6,13 @@ import numpy as np
 
 from active6d_bringup.camera.depth_registration import register_depth
 from active6d_bringup.camera.driver_images import decode_color, decode_depth
-from active6d_bringup.camera.preflight import check_depth_unit, check_matrices, check_pose, check_sizes
+from active6d_bringup.camera.preflight import (
+    check_depth_unit,
+    check_distance,
+    check_matrices,
+    check_pose,
+    check_sizes,
+)
 from active6d_bringup.camera.rectification import Rectifier
 from active6d_core.calibration import Calibration
 from active6d_core.camera import View
@@ -56,7 +62,11 @@ class ViewMaker:
         calibration = Calibration.from_info(info)
         doubts = check_matrices(calibration, self._rectified), check_pose(T_world_camera)
         self.warnings = [text for text in doubts if text]
-        for problem in (check_depth_unit(depth, distance), check_sizes(calibration, color)):
+        for problem in (
+            check_distance(T_world_camera),
+            check_depth_unit(depth, distance),
+            check_sizes(calibration, color),
+        ):
             if problem:
                 raise ValueError(problem)
         rectifier = self._rectifier(calibration, self._rectified)
