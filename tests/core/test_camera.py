@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from active6d_core.camera import (
     DEFAULT_CAMERA,
     PinholeCamera,
-    View,
     backproject,
     normals_from_points,
     pixel_rays,
@@ -99,36 +98,3 @@ def test_normals_next_to_a_hole_are_invalid():
     normals = normals_from_points(backproject(depth, CAMERA), 2)
     assert np.isnan(normals[[20, 20, 18, 22], [28, 32, 30, 30]]).all()
     assert np.isfinite(normals[10, 10]).all()
-
-
-COLOR, DEPTH = np.zeros((60, 80, 3), np.uint8), np.full((60, 80), 0.8, np.float32)
-SMALL = PinholeCamera(80, 60, 75.0, 75.0, 39.5, 29.5)
-
-
-@pytest.mark.parametrize("kind", ["f2", "f8", ">f4"])
-def test_a_view_converts_floating_point_depth_and_makes_what_is_no_distance_nan(kind):
-    depth = DEPTH.astype(kind)
-    depth[0, :4] = 0.0, -1.0, np.inf, np.nan
-    found = View(0, COLOR, depth, SMALL, np.eye(4)).depth
-    assert found.dtype == np.float32
-    assert np.isnan(found[0, :4]).all()
-    np.testing.assert_allclose(found[1:], DEPTH[1:], atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"depth": (1000 * DEPTH).astype(np.uint16)}, "depth must be .*got uint16.*make_view"),
-        ({"depth": 1000 * DEPTH}, "looks like millimetres"),
-        ({"depth": DEPTH[..., None]}, r"got float32 of shape \(60, 80, 1\)"),
-        ({"depth": DEPTH[::2, ::2]}, "depth has 40x30 pixels, the camera is for 80x60"),
-        ({"color": COLOR[..., 0]}, "color must be"),
-        ({"color": COLOR / 255.0}, "got float64"),
-        ({"color": COLOR[::2]}, "color has 80x30 pixels"),
-        ({"camera": PinholeCamera(1280, 720, 900.0, 900.0, 640.0, 360.0)}, "the camera is for 1280x720"),
-    ],
-)
-def test_a_view_refuses_what_is_no_rgbd_image_of_its_camera(change, words):
-    arrays = {"color": COLOR, "depth": DEPTH, "camera": SMALL, **change}
-    with pytest.raises(ValueError, match=words):
-        View(0, arrays["color"], arrays["depth"], arrays["camera"], np.eye(4))

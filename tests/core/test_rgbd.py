@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from active6d_core.camera import PinholeCamera
-from active6d_core.rgbd import check_color, check_depth, crop_depth, make_view
+from active6d_core.camera import PinholeCamera, View
+from active6d_core.rgbd import check_color, check_depth, check_view, crop_depth, make_view
 
 K = np.array([[500.0, 0.0, 32.0], [0.0, 510.0, 24.0], [0.0, 0.0, 1.0]])
 RGB = np.full((48, 64, 3), 90, np.uint8)
@@ -128,3 +128,51 @@ def test_what_leaves_nothing_is_refused():
         crop_depth(view, (1.0, 0.5))
     with pytest.raises(ValueError, match="region"):
         crop_depth(view, region=(np.ones(3), np.zeros(3)))
+
+
+BLACK, NEAR = np.zeros((60, 80, 3), np.uint8), np.full((60, 80), 0.8, np.float32)
+SMALL = PinholeCamera(80, 60, 75.0, 75.0, 39.5, 29.5)
+
+
+@pytest.mark.parametrize("kind", ["f2", "f8", ">f4"])
+def test_estimators_get_floating_point_depth_and_makes_what_is_no_distance_nan(kind):
+    depth = NEAR.astype(kind)
+    depth[0, :4] = 0.0, -1.0, np.inf, np.nan
+    found = check_view(View(0, BLACK, depth, SMALL, np.eye(4))).depth
+    assert found.dtype == np.float32
+    assert np.isnan(found[0, :4]).all()
+    np.testing.assert_allclose(found[1:], NEAR[1:], atol=1e-3)
+
+
+def test_estimators_get_a_usual_view_as_it_is():
+    view = View(0, BLACK, NEAR, SMALL, np.eye(4))
+    assert check_view(view) is view
+    empty = View(0, BLACK, np.zeros_like(NEAR), SMALL, np.eye(4))
+    assert np.isnan(check_view(empty).depth).all()
+
+
+def test_estimators_get_millimetres_and_grey_converted():
+    view = View(0, BLACK[..., 0], (1000 * NEAR).astype(np.uint16)[..., None], SMALL, np.eye(4))
+    np.testing.assert_allclose(check_view(view).depth, NEAR, atol=1e-6)
+    np.testing.assert_array_equal(check_view(view).color, BLACK)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"depth": 1000 * NEAR}, "looks like millimetres"),
+        ({"depth": NEAR[::2, ::2]}, "rgb is 80x60 pixels, depth 40x30"),
+        ({"color": BLACK / 255.0}, "got float64"),
+        ({"color": BLACK[::2]}, "rgb is 80x30"),
+        ({"camera": PinholeCamera(1280, 720, 900.0, 900.0, 640.0, 360.0)}, "the camera is for 1280x720"),
+    ],
+)
+def test_estimators_refuse_what_is_no_rgbd_image_of_its_camera(change, words):
+    arrays = {"color": BLACK, "depth": NEAR, "camera": SMALL, **change}
+    with pytest.raises(ValueError, match=words):
+        check_view(View(0, arrays["color"], arrays["depth"], arrays["camera"], np.eye(4)))
+
+
+def test_estimators_refuse_a_list_of_views():
+    with pytest.raises(ValueError, match="got list; estimate views one by one"):
+        check_view([View(0, BLACK, NEAR, SMALL, np.eye(4))])

@@ -8,8 +8,6 @@ import numpy as np
 # Focal lengths over the longer side of the image: from fields of view of 136 degrees to those of 3 degrees.
 _FOCAL_LENGTHS = (0.2, 20.0)
 _SAME_SURFACE = 0.02  # relative difference of depth
-_FARTHEST_DEPTH = 100.0  # metres
-_CONVERT = "active6d_core.rgbd.make_view converts arrays of other kinds"
 
 
 @dataclass(frozen=True)
@@ -100,8 +98,7 @@ DEFAULT_CAMERA = PinholeCamera.from_field_of_view(640, 480, 60.0)
 class View:
     """One registered RGB-D view.
 
-    Floating-point depth of another kind is converted, and zeros, negative and infinite values become NaN. For other
-    arrays that users have, there is :func:`active6d_core.rgbd.make_view`.
+    :func:`active6d_core.rgbd.make_view` makes one from arrays of many kinds.
 
     Attributes:
         stamp: nanoseconds; identifies the view on every topic.
@@ -109,9 +106,6 @@ class View:
         depth: (H, W) float32 metres along z (REP-118), NaN where invalid.
         camera: intrinsics of both images.
         T_world_camera: (4, 4) pose of the optical frame in the world.
-
-    Raises:
-        ValueError: images of another type or shape, of another size than the camera's, or depth that cannot be metres.
     """
 
     stamp: int
@@ -119,27 +113,6 @@ class View:
     depth: np.ndarray
     camera: PinholeCamera
     T_world_camera: np.ndarray
-
-    def __post_init__(self) -> None:
-        color, depth = np.asarray(self.color), np.asarray(self.depth)
-        size = self.camera.height, self.camera.width
-        if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3:
-            raise ValueError(f"color must be (H, W, 3) uint8, got {color.dtype} of shape {color.shape}; {_CONVERT}")
-        if depth.dtype.kind != "f" or depth.ndim != 2:
-            raise ValueError(f"depth must be (H, W) metres, got {depth.dtype} of shape {depth.shape}; {_CONVERT}")
-        for name, image in (("color", color), ("depth", depth)):
-            if image.shape[:2] != size:
-                raise ValueError(
-                    f"{name} has {image.shape[1]}x{image.shape[0]} pixels, the camera is for {size[1]}x{size[0]}"
-                )
-        depth = depth.astype(np.float32, copy=False)
-        valid = (depth > 0) & (depth < np.inf)
-        if np.count_nonzero(depth[valid] > _FARTHEST_DEPTH) > 0.5 * np.count_nonzero(valid):
-            raise ValueError(f"most of depth is over {_FARTHEST_DEPTH:g} m; it looks like millimetres; {_CONVERT}")
-        if not (valid | np.isnan(depth)).all():
-            depth = np.where(valid, depth, np.float32(np.nan))
-        object.__setattr__(self, "color", color)
-        object.__setattr__(self, "depth", depth)
 
 
 @lru_cache(maxsize=8)

@@ -4,6 +4,8 @@ Users bring depth in millimetres, zeros for missing pixels, or intrinsics of ano
 meaning is converted. What is impossible is refused with its likely cause.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from active6d_core.bounds import FARTHEST, PLAUSIBLE_DEPTH, check_image_size, limit_depth
@@ -54,6 +56,25 @@ def make_view(
     if np.linalg.norm(T[:3, 3]) > FARTHEST:
         raise ValueError(f"T_world_camera is over {FARTHEST:g} m from the origin; are its metres millimetres?")
     return View(stamp, color, metres, camera, T)
+
+
+def check_view(view: View) -> View:
+    """The view as estimators need it: unchanged if it is so, else as :func:`make_view` converts it.
+
+    A view without a valid pixel stays as it is: nothing is found in it.
+
+    Raises:
+        ValueError: the images cannot be meant; see :func:`make_view`.
+    """
+    if not isinstance(view, View):
+        raise ValueError(f"a View is needed, got {type(view).__name__}; estimate views one by one")
+    depth, color, size = np.asarray(view.depth), np.asarray(view.color), (view.camera.height, view.camera.width)
+    usual = depth.dtype == np.float32 and color.dtype == np.uint8 and depth.shape == size and color.shape == (*size, 3)
+    if usual and ((depth > 0) & (depth <= PLAUSIBLE_DEPTH[1]) | np.isnan(depth)).all():
+        return view
+    if usual and not ((depth > 0) & np.isfinite(depth)).any():
+        return replace(view, depth=np.full(size, np.nan, np.float32))
+    return make_view(color, depth, view.camera, T_world_camera=view.T_world_camera, stamp=view.stamp)
 
 
 def check_color(rgb: np.ndarray) -> np.ndarray:

@@ -19,6 +19,9 @@ class Estimator(Protocol):
         """Estimate pose hypotheses in the optical frame, with boxes and masks (paper, "6D object pose estimation").
 
         An estimator is deterministic: the same view gives the same hypotheses.
+
+        Raises:
+            ValueError: the images cannot be meant, see :func:`active6d_core.rgbd.check_view`.
         """
         ...
 

@@ -115,11 +115,7 @@ class BopScene:
         color = _require_size(read_color(color_path), color_path, camera)
         steps = _require_size(read_depth(depth_path), depth_path, camera)
         depth = np.where(steps > 0, steps * (self.depth_scale[index] * 1e-3), np.nan).astype(np.float32)
-        try:
-            return View(stamp, color, depth, camera, self.T_world_camera[index])
-        except ValueError as error:
-            steps_in = f"{CAMERA_FILE} says {self.depth_scale[index]:g} millimetres for each step of the image"
-            raise ValueError(f"{depth_path}: {error}; {steps_in}") from error
+        return View(stamp, color, depth, camera, self.T_world_camera[index])
 
     def nearest(self, position: np.ndarray) -> int:
         """Index of the view whose direction from the world's origin is nearest to that of (3,) ``position``, metres."""

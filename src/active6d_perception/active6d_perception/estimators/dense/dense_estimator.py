@@ -13,6 +13,7 @@ from scipy.special import logit, softmax
 from active6d_core.camera import View, pool_depth
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
+from active6d_core.rgbd import check_view
 from active6d_perception.estimators.dense.axis_rotation import AxisRotationSearch, likely_axis_rotations
 from active6d_perception.estimators.dense.canonical_frame import AXIS_ANGLES, AxisRotation, rotation_about_z
 from active6d_perception.estimators.dense.decoding import (
@@ -134,6 +135,7 @@ class DenseEstimator:
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimators.registry.Estimator.estimate`."""
+        view = check_view(view)
         self.stage_ms = {}
         poses, label = self.locate(view)
         self.certainty = poses.certainty

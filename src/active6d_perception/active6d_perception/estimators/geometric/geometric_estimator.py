@@ -9,6 +9,7 @@ import numpy as np
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
+from active6d_core.rgbd import check_view
 from active6d_perception.estimators.geometric.foreground import Surface, measure_surface
 from active6d_perception.estimators.geometric.multi_start import Starts, thin_out
 from active6d_perception.estimators.geometric.pair_voting import PairVoting
@@ -111,6 +112,7 @@ class GeometricEstimator:
 
     def estimate(self, view: View) -> Hypotheses:
         """See :meth:`active6d_perception.estimators.registry.Estimator.estimate`."""
+        view = check_view(view)
         surface = measure_surface(view.depth, view.camera, self.model.diameter)
         poses, label, features = self.candidates(surface)
         score = self._score.probability(features)
