@@ -1,6 +1,7 @@
 """A made-up bank: an estimator that errs the more, the more other objects stand in its line of sight."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -63,7 +64,7 @@ def synthetic_bank(object_name: str = "mug", scenes: int = 2, objects: int = 8, 
     )
 
 
-def observe_synthetic(name: str, log: str) -> BankScene:
+def observe_synthetic(name: str, views: Path | None, log: str) -> BankScene:
     """Picklable stand-in for simulator and estimator; notes down what it was asked for."""
     with open(log, "a") as file:
         file.write(name + "\n")

@@ -9,7 +9,8 @@ import pytest
 from synthetic_bank import observe_synthetic, synthetic_bank, synthetic_scene
 
 from active6d_agent.bank import scene_bank
-from active6d_agent.bank.scene_bank import BankScene, build_bank, load_bank, observe_scene, view_entropy
+from active6d_agent.bank.observation import observe_scene, view_entropy
+from active6d_agent.bank.scene_bank import BankScene, build_bank, load_bank
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import e_add
@@ -69,6 +70,62 @@ def test_scenes_made_otherwise_are_made_again(tmp_path):
     assert load_bank(path).provenance == {"noise": 2}
 
 
+def test_an_interrupted_scene_goes_on_with_its_next_view(tmp_path):
+    """The camera fails at the fourth view. A view whose file is damaged is observed again."""
+    log = tmp_path / "log"
+    observe = functools.partial(observe_by_eye, log=log)
+    with pytest.raises(OSError, match="no image"):
+        observe(tmp_path / "views", broken=3)
+    damaged = tmp_path / "views" / "1.npz"
+    damaged.write_bytes(damaged.read_bytes()[:-20])
+    scene = observe(tmp_path / "views")
+    assert log.read_text().split() == ["1", "2", "3", "4", "2", "4", "5", "6"]
+    whole = observe(None)
+    assert_equal(scene, whole)
+    for table in ("T_world_body", "place", "T_world_object", "body", "twin", "telling"):
+        np.testing.assert_array_equal(getattr(scene.evidence, table), getattr(whole.evidence, table))
+
+
+def test_views_of_an_unfinished_scene_are_of_one_provenance_and_go_when_it_is_done(tmp_path):
+    folders = []
+
+    def observe(name, views):
+        folders.append(views)
+        views.mkdir(parents=True, exist_ok=True)
+        if len(folders) < 3:
+            raise OSError("interrupted")
+        return synthetic_scene("mug", 1, 3, SPHERE)
+
+    for noise in (1, 2, 2):
+        bank = scene_bank.SceneBank("mug", SPHERE, GRID, [], {"noise": noise})
+        with contextlib.suppress(OSError):
+            scene_bank._observe_to_file(observe, "mug/x/1", tmp_path / "bank.parts" / "x.npz", bank)
+    assert folders[0] != folders[1] == folders[2]
+    assert folders[0].is_dir()
+    assert not folders[1].exists()
+
+
+FEW = ViewSphere(elevations_degrees=(45.0,), azimuths=6)
+
+
+def observe_by_eye(views, *, log, broken=-1):
+    """One mug seen by a perfect estimator; the camera breaks at the view of index ``broken``."""
+    truth, camera = synthetic_scene("mug", 1, 2, FEW).T_world_object, PinholeCamera.from_field_of_view(64, 48, 60.0)
+
+    def capture(T_world_camera, stamp):
+        number = stamp // 1_000_000_000
+        with log.open("a") as file:
+            file.write(f"{number}\n")
+        if number == broken + 1:
+            raise OSError("no image")
+        depth = np.full((48, 64), 0.7, np.float32)
+        return View(stamp, np.zeros((48, 64, 3), np.uint8), depth, camera, T_world_camera)
+
+    model = load_object("mug")
+    arguments = truth, capture, PerfectEstimator(truth), ConstantVerifier(), model, FEW, GRID
+    return observe_scene("mug/synthetic/1", *arguments, views=views)
+
+
 class PerfectEstimator:
     """Reports every object of the scene, shifted by 2 mm along the optical axis."""
 
@@ -79,9 +136,9 @@ class PerfectEstimator:
         T = invert(view.T_world_camera) @ self.T_world_object
         T[:, 2, 3] += 0.002
         label = np.arange(1, len(T) + 1).astype(np.uint16)
-        segmentation = np.zeros((4, 6), np.uint16)
+        segmentation = np.zeros(view.depth.shape, np.uint16)
         segmentation[0, : len(T)] = label
-        return Hypotheses.from_masks(T, np.full(len(T), 0.9), label, segmentation, np.full((4, 6), 0.7))
+        return Hypotheses.from_masks(T, np.full(len(T), 0.9), label, segmentation, view.depth)
 
 
 class ConstantVerifier:

@@ -10,7 +10,8 @@ from scipy.special import expit
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.belief_kernel import fuse_episode
 from active6d_agent.bank.joint_lookup import JointLookup, index_scene, make_belief, make_lookup
-from active6d_agent.bank.scene_bank import SceneBank, load_bank, observe_scene
+from active6d_agent.bank.observation import observe_scene
+from active6d_agent.bank.scene_bank import SceneBank, load_bank
 from active6d_core.camera import DEFAULT_CAMERA
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import DETECTION_FRACTION, e_add

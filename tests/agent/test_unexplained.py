@@ -7,7 +7,8 @@ from sensor_msgs.msg import PointCloud2
 from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
-from active6d_agent.bank.scene_bank import SceneBank, load_bank, observe_scene
+from active6d_agent.bank.observation import observe_scene
+from active6d_agent.bank.scene_bank import SceneBank, load_bank
 from active6d_agent.environment.rollout import observe
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object

@@ -1,11 +1,13 @@
 """Scene banks from simulated scenes: which scenes a bank holds, and what the estimator finds in each view of them."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from active6d_agent.bank.candidate_pruning import prune_candidates
-from active6d_agent.bank.scene_bank import BankScene, SceneBank, observe_scene
+from active6d_agent.bank.observation import observe_scene
+from active6d_agent.bank.scene_bank import BankScene, SceneBank
 from active6d_core.files import sha256_of
 from active6d_core.metrics import DETECTION_FRACTION
 from active6d_core.object_model import load_object
@@ -54,10 +56,13 @@ def bank_provenance(object_name: str, estimator: str, noise: float, seed: int) -
     return provenance
 
 
-def observe_scene_by_name(name: str, *, estimator: str, noise: float, seed: int, sensor: str = AUTOMATIC) -> BankScene:
+def observe_scene_by_name(
+    name: str, views: Path | None = None, *, estimator: str, noise: float, seed: int, sensor: str = AUTOMATIC
+) -> BankScene:
     """Observe one scene from every view with the deployed estimator and verification; runs in its own process.
 
-    Candidates that hardly any choice of views makes probable are left out, see :mod:`.candidate_pruning`.
+    Views are kept in the folder ``views`` until the scene is done. Candidates that hardly any choice of views
+    makes probable are left out, see :mod:`.candidate_pruning`.
     """
     object_name, kind, number = name.split("/")
     model = load_object(object_name)
@@ -73,6 +78,7 @@ def observe_scene_by_name(name: str, *, estimator: str, noise: float, seed: int,
         model,
         sphere,
         grid,
+        views=views,
     )
     bank = SceneBank(object_name, sphere, grid, [observed], {})
     return prune_candidates(bank, np.random.default_rng(seed)).scenes[0]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 
-from active6d_agent.bank.scene_bank import view_entropy
+from active6d_agent.bank.observation import view_entropy
 from active6d_agent.environment.rollout import EpisodeResults
 from active6d_agent.policies.episode_state import Limits
 from active6d_agent.policies.registry import create_policy

@@ -10,7 +10,9 @@ one compressed ``.npz`` per object and split, without pickled data. It holds:
 - what each view says of the candidates of the scene, for the fusion of all views (:mod:`.evidence_tables`).
 """
 
+import hashlib
 import json
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
@@ -21,26 +23,21 @@ from typing import Any
 import numpy as np
 
 from active6d_core.array_archive import read_archive
-from active6d_core.camera import View
 from active6d_core.files import atomic_file, cache_folder
 from active6d_core.interrupts import worker_pool
-from active6d_core.metrics import MISSED_E_ADD, e_add
 from active6d_core.object_model import ObjectModel, load_object
-from active6d_core.se3 import quaternion_from_transform, transform_from_quaternion
+from active6d_core.se3 import transform_from_quaternion
 from active6d_core.structured_text import parse_json
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.estimators.registry import Estimator
-from active6d_perception.scene.belief_weights import BeliefWeights
-from active6d_perception.scene.evidence_tables import EvidenceTables, tabulate
-from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.evidence_tables import EvidenceTables
 from active6d_perception.scene.observed_surface import SurfaceGrid
-from active6d_perception.scene.verification import Verifier
 
 FORMAT = 3
 #: Banks of this format have no evidence; their look-up fuses by the best view.
 _WITHOUT_EVIDENCE = 2
 SHIPPED_BANKS = Path(__file__).parent / "shipped"
 _MOST_PAIRS = 50_000_000
+_VIEWS_SUFFIX = ".views"
 _HYPOTHESIS_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw", "verification", "score", "x0", "y0", "x1", "y1", "depth")
 
 
@@ -88,75 +85,11 @@ class BankScene:
             raise ValueError(f"{self.name}: evidence is of {len(self.evidence.body)} views, not {len(self.entropy)}")
 
 
-def observe_scene(
-    name: str,
-    T_world_object: np.ndarray,
-    capture: Callable[[np.ndarray, int], View],
-    estimator: Estimator,
-    verifier: Verifier,
-    model: ObjectModel,
-    sphere: ViewSphere,
-    grid: SurfaceGrid,
-) -> BankScene:
-    """Run estimator and verification on every view of the grid.
-
-    Args:
-        name: of the scene.
-        T_world_object: (n, 4, 4) true poses.
-        capture: ``T_world_camera`` and a stamp in nanoseconds to the view there.
-        estimator: the deployed one.
-        verifier: the deployed one.
-        model: the object.
-        sphere: the views.
-        grid: of the surface.
-    """
-    views, tables, entropy, surface = [], [], [], []
-    fusion = JointFusion(model, weights=BeliefWeights.indifferent())
-    for index, position in enumerate(sphere.positions):
-        view = capture(sphere.pose(position), (index + 1) * 1_000_000_000)
-        hypotheses = estimator.estimate(view)
-        verification = verifier.score(view.depth, view.camera, hypotheses)
-        known = view.stamp, view.T_world_camera, hypotheses, verification
-        fusion.add_view(*known, view.depth, view.camera)
-        T = hypotheses.T_camera_object
-        rows = [
-            T[:, :3, 3],
-            quaternion_from_transform(T),
-            verification,
-            hypotheses.score,
-            hypotheses.box,
-            hypotheses.depth,
-        ]
-        tables.append(np.column_stack(rows).astype(np.float32))
-        views.append(np.full(len(hypotheses), index))
-        entropy.append(view_entropy(hypotheses.segmentation))
-        surface.append(np.packbits(grid.observe(view.depth, view.camera, view.T_world_camera)))
-    of_view, table = np.concatenate(views), np.concatenate(tables)
-    errors = e_add(model, world_poses(table, of_view, sphere)[:, None], T_world_object[None], cutoff=MISSED_E_ADD)
-    errors[errors >= MISSED_E_ADD] = np.inf
-    errors = errors.astype(np.float32)
-    return BankScene(
-        name, T_world_object, of_view, table, errors, np.array(entropy), np.stack(surface), tabulate(fusion)
-    )
-
-
-def view_entropy(segmentation: np.ndarray) -> float:
-    """Shannon entropy in nats of the relative areas of the predicted masks, the background among them.
-
-    Vazquez's viewpoint entropy, as in the entropy-based baseline's source.
-
-    Args:
-        segmentation: (H, W) label per pixel.
-    """
-    areas = np.unique(segmentation, return_counts=True)[1] / segmentation.size
-    return float(-(areas * np.log(areas)).sum())
-
-
 def build_bank(
     path: Path,
     object_name: str,
     scenes: Sequence[str],
-    observe: Callable[[str], BankScene],
+    observe: Callable[[str, Path], BankScene],
     *,
     workers: int = 1,
     provenance: dict[str, Any] | None = None,
@@ -165,14 +98,16 @@ def build_bank(
 ) -> Iterator[str]:
     """Observe all scenes and write the bank; yields each scene's name as it is done.
 
-    Finished scenes are kept beside ``path`` until the bank is complete, so an interrupted run continues where it
-    stopped. An existing bank is extended. Scenes of another ``provenance`` are made again.
+    Finished scenes, and the views of unfinished ones, are kept beside ``path`` until the bank is complete, so an
+    interrupted run continues where it stopped. An existing bank is extended. Scenes of another ``provenance`` are made
+    again.
 
     Args:
         path: of the ``.npz`` to write.
         object_name: of the object.
         scenes: their names, in the bank's order.
-        observe: name to what was seen; it must be picklable (a module's function, or a ``functools.partial`` of one).
+        observe: name of a scene, and a folder for what is kept of its views until it is done, to what was seen. It
+            must be picklable (a module's function, or a ``functools.partial`` of one).
         workers: processes.
         provenance: what the bank depends on and remembers: estimator, its parameters, noise, versions; JSON values.
         sphere: grid of the views, the default one when None.
@@ -195,6 +130,8 @@ def build_bank(
     replace(empty, scenes=[made[name] for name in scenes]).save(path)
     for file in files.values():
         file.unlink()
+    for folder in parts.glob(f"*{_VIEWS_SUFFIX}"):  # of another provenance
+        shutil.rmtree(folder)
     if not any(parts.iterdir()):
         parts.rmdir()
 
@@ -210,8 +147,11 @@ def _scenes_of(path: Path, like: "SceneBank") -> dict[str, BankScene]:
     return {scene.name: scene for scene in bank.scenes} if same else {}
 
 
-def _observe_to_file(observe: Callable[[str], BankScene], name: str, path: Path, bank: "SceneBank") -> None:
-    replace(bank, scenes=[observe(name)]).save(path)
+def _observe_to_file(observe: Callable[[str, Path], BankScene], name: str, path: Path, bank: "SceneBank") -> None:
+    digest = hashlib.sha256(json.dumps(bank.header()).encode()).hexdigest()[:16]
+    views = path.with_suffix(f".{digest}{_VIEWS_SUFFIX}")
+    replace(bank, scenes=[observe(name, views)]).save(path)
+    shutil.rmtree(views, ignore_errors=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,9 +186,9 @@ class SceneBank:
         """The object."""
         return load_object(self.object_name)
 
-    def save(self, path: Path) -> None:
-        """Write one compressed ``.npz``; it appears under its name only when it is complete."""
-        header = {
+    def header(self) -> dict[str, Any]:
+        """What the bank is of and how it was made, as JSON values."""
+        return {
             "format": FORMAT,
             "object": self.object_name,
             "scenes": [scene.name for scene in self.scenes],
@@ -258,13 +198,16 @@ class SceneBank:
             "surface": asdict(self.grid),
             "provenance": self.provenance,
         }
+
+    def save(self, path: Path) -> None:
+        """Write one compressed ``.npz``; it appears under its name only when it is complete."""
         pairs = [np.nonzero(np.isfinite(scene.errors)) for scene in self.scenes]
         evidence = [scene.evidence for scene in self.scenes if scene.evidence is not None]
         tables: dict[str, Any] = _evidence_arrays(evidence) if len(evidence) == len(self.scenes) > 0 else {}
         with atomic_file(path) as unfinished:
             np.savez_compressed(
                 unfinished,
-                header=json.dumps(header),
+                header=json.dumps(self.header()),
                 object_count=[len(scene.T_world_object) for scene in self.scenes],
                 T_world_object=np.concatenate([scene.T_world_object for scene in self.scenes]),
                 hypothesis_count=[np.bincount(s.view, minlength=len(self.sphere)) for s in self.scenes],
