@@ -51,6 +51,9 @@ class Job:
         return all((root / file).is_file() for file in files)
 
 
+#: Key of a report by which it is known whether its figure exists.
+_DRAWN = "is_drawn"
+
 JOBS = {
     job.name: job
     for job in (
@@ -94,9 +97,10 @@ def read_reports(root: Path) -> Mapping[str, Measured]:
             path = root / job.report(name)
             if path.is_file():
                 try:
-                    measured[name][job.name] = json.loads(path.read_text())
+                    report = json.loads(path.read_text())
                 except ValueError as error:
                     raise ValueError(f"{path}: damaged result ({error}); delete it and measure it again") from error
+                measured[name][job.name] = {**report, _DRAWN: (root / job.figure(name)).is_file()}
     return measured
 
 
@@ -130,7 +134,8 @@ def _block(name: str, make: Callable[[tables.Reports], str]) -> Callable[[Mappin
         reports = _of_job(name, measured)
         parts = [_command(name), make(reports) if reports else "Not measured yet."]
         if JOBS[name].draws:
-            parts += [f"![{name}, {each}](img/{Path(JOBS[name].figure(each)).name})" for each in reports]
+            drawn = [each for each, report in reports.items() if report.get(_DRAWN, True)]
+            parts += [f"![{name}, {each}](img/{Path(JOBS[name].figure(each)).name})" for each in drawn]
         return "\n\n".join(parts)
 
     return render
