@@ -11,6 +11,7 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model import model_views
 from active6d_perception.scene import (
     body_refinement,
+    camera_alignment,
     feasibility,
     fusion,
     joint_fusion,
@@ -22,7 +23,7 @@ from active6d_perception.scene import (
 from active6d_perception.scene import expected_visibility as visibility
 from active6d_perception.scene import observed_surface as surface
 
-JOINT = (body_refinement, feasibility, measured_cases, measured_view, pose_lattice)
+JOINT = (body_refinement, camera_alignment, feasibility, measured_cases, measured_view, pose_lattice)
 MODULES = (fusion, model_views, surface, verification, visibility, *JOINT)
 
 

@@ -25,6 +25,7 @@ from active6d_core.ros.conversions import (
     ns_to_stamp,
     objects_from_cloud,
     points_from_cloud,
+    poses_from_array,
     segmentation_to_image,
     stamp_to_ns,
     transform_to_pose_stamped,
@@ -41,6 +42,9 @@ from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
 from active6d_perception.scene.verification import Verifier
+from active6d_sim.rendering.active_stereo import ActiveStereo
+from active6d_sim.rendering.simulator import Simulator
+from active6d_sim.scenes.scene_store import find_scene
 
 FRAME = "camera_optical_frame"
 CAMERA = DEFAULT_CAMERA.scaled(0.25)
@@ -284,6 +288,38 @@ def test_fusion_from_all_views_is_that_of_the_core(graph, seen, tmp_path, monkey
         np.testing.assert_allclose(getattr(published, name), getattr(expected, name), atol=1e-3, err_msg=name)
     assert 0.5 < published.probability[0] < 0.99
     assert markers[0].markers[1].color.a == pytest.approx(0.3)
+
+
+def test_wrong_camera_poses_are_corrected_and_reported(graph, tmp_path, monkeypatch):
+    """Of three views of a stored scene the second says that it is 12 mm beside where it is. Surface that both show is
+    not doubled, the corrected poses are offered, and the diagnostics say by how much the pose was corrected."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    scene = find_scene("mug", "mug/val/0", 0)
+    simulator = Simulator(scene, DEFAULT_CAMERA.scaled(0.5), noise=ActiveStereo().scaled(0.0))
+    true = [SPHERE.pose(SPHERE.positions[view]) for view in (62, 65, 68)]
+    said = list(true)
+    said[1] = make_transform(np.eye(3), np.array([0.010, -0.006, 0.003])) @ true[1]
+    graph.add(HypothesisFusionNode(context=graph.context))
+    poses = graph.mailbox(PoseArray, "objects/camera_poses", True)
+    statuses = graph.mailbox(DiagnosticArray, "/diagnostics")
+    for number, (T_true, T_said) in enumerate(zip(true, said, strict=True)):
+        view = simulator.capture(T_true, (number + 1) * SECOND)
+        messages = {
+            "camera/depth/image_raw": depth_to_image(view.depth, view.stamp, FRAME),
+            "camera/color/camera_info": camera_to_info(view.camera, view.stamp, FRAME),
+            "camera/pose": transform_to_pose_stamped(T_said, view.stamp, "world"),
+            "hypotheses": hypotheses_to_cloud(Hypotheses.empty(*view.depth.shape), view.stamp, FRAME),
+            "hypotheses/segmentation": segmentation_to_image(np.zeros(view.depth.shape, np.uint16), view.stamp, FRAME),
+        }
+        send(graph, messages, FUSION_INPUTS)
+        graph.spin_until_filled([poses], number + 1)
+    corrected = poses_from_array(poses[-1], "world")
+    # The mean of the three errors stays, the differences between them do not.
+    mean = make_transform(np.eye(3), np.array([0.010, -0.006, 0.003]) / 3)
+    for T, T_true in zip(corrected, true, strict=True):
+        np.testing.assert_allclose(T[:3, 3], (mean @ T_true)[:3, 3], atol=0.003)
+    told = [value.value for each in statuses for status in each.status for value in status.values]
+    assert sum("the camera's pose was corrected by 12." in text for text in told) == 1
 
 
 def test_weights_that_do_not_fit_are_named(graph, tmp_path, monkeypatch):

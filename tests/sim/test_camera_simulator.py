@@ -25,6 +25,7 @@ from active6d_core.ros.episode_messages import GoalState, GoalStatus
 from active6d_core.se3 import look_at, make_transform
 from active6d_sim.nodes.camera_simulator import CameraSimulatorNode
 from active6d_sim.rendering.active_stereo import ActiveStereo
+from active6d_sim.rendering.pose_error import PoseError
 from active6d_sim.rendering.sensor_registry import list_sensors, register_sensor
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.robot.arm import CameraArm, hand_eye_error
@@ -168,6 +169,22 @@ def test_an_arm_refuses_what_it_cannot_reach_and_takes_its_time(watched, mugs):
     true = exact.capture(told @ hand_eye_error(20.0, 0.0, 0), watched.stamps()[1]).depth
     np.testing.assert_array_equal(depth, true)
     assert not np.array_equal(depth, exact.capture(told, watched.stamps()[1]).depth, equal_nan=True)
+
+
+def test_poses_are_said_with_errors_when_asked_for(watched, mugs):
+    """Every view is seen from beside where it says that it is, by an error of its own that the seed repeats."""
+    watched.start(pose_error_mm=8.0, pose_error_degrees=0.5, noise_scale=0.0)
+    watched.goal(SPHERE.pose(SPHERE.positions[48]), stamp=SECOND)
+    watched.wait(2)
+    camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
+    exact, errors = Simulator(mugs, camera, ActiveStereo().scaled(0.0)), []
+    for pose, stamp, image in zip(
+        watched.poses(), watched.stamps(), watched.boxes["camera/depth/image_raw"], strict=False
+    ):
+        errors.append(PoseError(8.0, 0.5).draw(np.random.default_rng([0, mugs.seed, stamp])))
+        np.testing.assert_array_equal(image_to_depth(image), exact.capture(pose @ errors[-1], stamp).depth)
+    same_pose(watched.poses()[1], SPHERE.pose(SPHERE.positions[48]))
+    assert np.abs(errors[0] - errors[1]).max() > 1e-3
 
 
 def test_an_arm_that_cannot_take_the_start_view_says_so(graph):

@@ -11,8 +11,9 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.belief_weights import BeliefWeights
 from active6d_perception.scene.fusion import FusionParameters
 from active6d_perception.scene.measured_view import MeasuredView
+from active6d_sim.rendering.pose_error import PoseError
 from active6d_tools.benchmark.fusion_methods import MethodResults, compare_methods
-from active6d_tools.processed_scene import PoseError, ProcessedView
+from active6d_tools.processed_scene import ProcessedView, disturb
 
 
 def test_only_confirmed_objects_count_and_wrong_ones_are_told():
@@ -53,10 +54,10 @@ def test_a_wrong_camera_moves_what_is_in_the_world_and_nothing_in_its_frame():
     depth, normals, instance = np.ones((2, 2), np.float32), np.zeros((2, 2, 3), np.int8), np.zeros((2, 2), np.int16)
     measured = MeasuredView(depth, normals, instance, middles, invert(T), 2.0, 2.0, 0.5, 0.5)
     view = ProcessedView(1, T, DEFAULT_CAMERA, Hypotheses.empty(2, 2), np.zeros(0), measured)
-    assert PoseError().disturb(view, rng) is view
+    assert disturb(view, PoseError(), rng) is view
     shifts, angles = [], []
     for _ in range(300):
-        wrong = PoseError(5.0, 0.5).disturb(view, rng)
+        wrong = disturb(view, PoseError(5.0, 0.5), rng)
         off = invert(T) @ wrong.T_world_camera
         shifts.append(off[:3, 3])
         angles.append(rotation_angle(np.eye(3), off[:3, :3]))

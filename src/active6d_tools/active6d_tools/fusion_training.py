@@ -121,7 +121,9 @@ def _episodes(
 ) -> Iterator[tuple[JointFusion, ProcessedView, np.ndarray]]:
     """Fusion after each episode's views, its last view, and the true poses."""
     processed = ProcessedScene(name, estimator, seed=seed)
-    fusion, rng = JointFusion(processed.model, weights=weights), np.random.default_rng([seed, int(name.split("/")[-1])])
+    # The poses of the simulated camera are right.
+    fusion = JointFusion(processed.model, weights=weights, align=False)
+    rng = np.random.default_rng([seed, int(name.split("/")[-1])])
     for episode in range(episodes):
         fusion.reset()
         for index in processed.pool.draw(_VIEWS[episode % len(_VIEWS)], ring=episode % 4 == 0, rng=rng):

@@ -3,20 +3,19 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
-from active6d_core.se3 import invert, make_transform, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator
 from active6d_perception.model.ambiguity import ambiguity_of
 from active6d_perception.scene.fusion import SceneFusion
 from active6d_perception.scene.joint_fusion import JointFusion
-from active6d_perception.scene.measured_view import MeasuredView, measure_view
+from active6d_perception.scene.measured_view import MeasuredView, measure_view, move_view
 from active6d_perception.scene.verification import Verifier
+from active6d_sim.rendering.pose_error import PoseError
 from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.simulator import NANOSECONDS, Simulator
 from active6d_sim.scenes.scene_store import find_scene
@@ -49,24 +48,12 @@ class ProcessedView:
     measured: MeasuredView
 
 
-@dataclass(frozen=True)
-class PoseError:
-    """How wrong the poses of the camera are said to be: root mean squares of a shift and of a rotation angle."""
-
-    millimetres: float = 0.0
-    degrees: float = 0.0
-
-    def disturb(self, view: ProcessedView, rng: np.random.Generator) -> ProcessedView:
-        """The view with a wrong pose of its camera; what is in the camera's frame stays."""
-        if not (self.millimetres or self.degrees):
-            return view
-        angles = rng.normal(0.0, np.radians(self.degrees) / np.sqrt(3), 3)
-        shift = rng.normal(0.0, 1e-3 * self.millimetres / np.sqrt(3), 3)
-        T_camera_wrong = make_transform(Rotation.from_rotvec(angles).as_matrix(), shift)
-        T_world_wrong, T_camera_world = view.T_world_camera @ T_camera_wrong, invert(view.T_world_camera)
-        middles = transform_points(T_world_wrong @ T_camera_world, view.measured.middles)
-        measured = view.measured._replace(T_camera_world=invert(T_world_wrong), middles=middles)
-        return replace(view, T_world_camera=T_world_wrong, measured=measured)
+def disturb(view: ProcessedView, error: PoseError, rng: np.random.Generator) -> ProcessedView:
+    """The view with a wrong pose of its camera; what is in the camera's frame stays."""
+    if error == PoseError():
+        return view
+    T_world_wrong = view.T_world_camera @ error.draw(rng)
+    return replace(view, T_world_camera=T_world_wrong, measured=move_view(view.measured, T_world_wrong))
 
 
 class ProcessedScene:

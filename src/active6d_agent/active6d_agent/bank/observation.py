@@ -142,7 +142,7 @@ def observe_scene(
         views: folder in which each view is kept, so that only missing ones are observed; None keeps nothing.
     """
     observed = []
-    fusion = JointFusion(model, weights=BeliefWeights.indifferent())
+    fusion = JointFusion(model, weights=BeliefWeights.indifferent(), align=False)
     for index, position in enumerate(sphere.positions):
         T_world_camera, stamp = sphere.pose(position), (index + 1) * 1_000_000_000
         file = None if views is None else views / f"{index}.npz"

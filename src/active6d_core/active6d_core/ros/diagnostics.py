@@ -83,7 +83,7 @@ class DiagnosticNode(ParameterNode):
     def measure(self, stamp: int) -> Iterator[list[str]]:
         """Time the work on the view with this stamp: latency and rate go to /diagnostics, one line to the log.
 
-        What the block appends to the list it gets, such as "8 hypotheses", is in that line.
+        What the block appends to the list it gets, such as "8 hypotheses", is in that line and in the diagnostics.
         """
         summary: list[str] = []
         started = time.perf_counter()
@@ -91,7 +91,7 @@ class DiagnosticNode(ParameterNode):
         finished = time.perf_counter()
         self._views_measured += 1
         latency_ms = (finished - started) * 1e3
-        values = {"latency_ms": f"{latency_ms:.3f}"}
+        values = {"latency_ms": f"{latency_ms:.3f}", "summary": ", ".join(summary)}
         if self._last_view_at is not None:
             values["rate_hz"] = f"{1.0 / max(finished - self._last_view_at, 1e-9):.3f}"
         self._last_view_at = finished

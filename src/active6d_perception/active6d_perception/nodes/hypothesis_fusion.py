@@ -32,6 +32,8 @@ from active6d_core.ros.node import GraphNode
 from active6d_core.ros.optional_outputs import DetectionOutput
 from active6d_core.ros.runner import run_node
 from active6d_core.ros.view_inputs import ViewInputs
+from active6d_core.se3 import invert, transform_points
+from active6d_perception.scene.camera_alignment import CameraAlignment
 from active6d_perception.scene.expected_visibility import Tray
 from active6d_perception.scene.fusion import METHODS, RANKINGS, FusionParameters, SceneFusion
 from active6d_perception.scene.joint_fusion import JointFusion
@@ -60,6 +62,7 @@ class HypothesisFusionNode(GraphNode):
         self._poses = self.output(topics.OBJECTS_POSES)
         self._markers = self.output(topics.OBJECTS_MARKERS)
         self._unexplained = self.output(topics.UNEXPLAINED)
+        self._camera_poses = self.output(topics.CAMERA_POSES)
         self._detections = DetectionOutput(self)
         self.input(topics.HYPOTHESES, self._on_hypotheses)
         self.input(topics.SEGMENTATION, self._on_segmentation)
@@ -86,6 +89,11 @@ class HypothesisFusionNode(GraphNode):
             "less probable objects are withdrawn; only by the method all-views",
             minimum=0.0,
             maximum=1.0,
+        )
+        self.declare(
+            "align_views",
+            True,
+            "correct the camera's poses by aligning the depth images of the views; only by the method all-views",
         )
         self.declare("bin_width", 0.0, "between the bin's inner walls, metres; 0: that of the usual bin", minimum=0.0)
         self.declare(
@@ -152,6 +160,7 @@ class HypothesisFusionNode(GraphNode):
         parameters = FusionParameters(**{each.name: self.value(each.name) for each in fields(FusionParameters)})
         self._verifier = Verifier(self._model, self.value("epsilon"), self.value("samples"))
         self._settings, self._fusion = parameters, self._make_fusion(parameters)
+        self._cameras = self._fusion.cameras if isinstance(self._fusion, JointFusion) else CameraAlignment()
         self._surface = ObservedSurface(self._model, self._make_grid(), parameters.explained_within)
         self._mesh_uri = ""
         try:
@@ -164,7 +173,7 @@ class HypothesisFusionNode(GraphNode):
             return SceneFusion(self._model, parameters)
         usual, width, height = Tray.for_model(self._model), self.value("bin_width"), self.value("wall_height")
         tray = Tray(width or usual.width, usual.wall_height if height < 0 else height)
-        return JointFusion(self._model, parameters, tray=tray)
+        return JointFusion(self._model, parameters, tray=tray, align=self.value("align_views"))
 
     def _make_grid(self) -> SurfaceGrid:
         usual = SurfaceGrid.for_model(self._model)
@@ -214,11 +223,16 @@ class HypothesisFusionNode(GraphNode):
                 self._fusion.add_view(*found, values["depth"], values["camera"])
             else:
                 self._fusion.add_view(*found)
-            self._surface.add_view(stamp, values["depth"], values["camera"], values["pose"])
+            aligned = self._cameras.alignment(stamp)
+            self._surface.add_view(stamp, values["depth"], values["camera"], aligned.correction @ values["pose"])
             self._latest = stamp, values["pose"], values["camera"]
             objects = self._publish(*self._latest)
             confirmed = np.count_nonzero(objects.probability >= self._settings.confirmed)
             summary.append(f"{len(hypotheses)} hypotheses, {len(objects)} objects, {confirmed} of them confirmed")
+            if aligned.shift:
+                summary.append(f"the camera's pose was corrected by {1e3 * aligned.shift:.1f} mm at the scene")
+            if not aligned.aligned:
+                summary.append("the depth image could not be aligned with the others, the camera's pose is as given")
 
     def _publish(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
         """Publish the objects after the latest view, and return them."""
@@ -228,8 +242,11 @@ class HypothesisFusionNode(GraphNode):
         confirmed = self._settings.confirmed
         shown = objects if self._mesh_uri else SceneObjects.empty()
         self._markers.publish(objects_to_markers(shown, self._mesh_uri, stamp, self.world_frame, confirmed))
-        unexplained = self._surface.unexplained(objects.T_world_object)
+        T_world_anchor = self._cameras.T_world_anchor
+        unexplained = self._surface.unexplained(invert(T_world_anchor) @ objects.T_world_object)
+        unexplained = transform_points(T_world_anchor, unexplained)
         self._unexplained.publish(points_to_cloud(unexplained, stamp, self.world_frame))
+        self._camera_poses.publish(poses_to_array(self._cameras.T_world_cameras(), stamp, self.world_frame))
         self._detections.publish(objects, self._model, stamp, self.world_frame)
         return objects
 

@@ -4,8 +4,9 @@
 evidence is what every depth image measured where a candidate has its surface: that surface, something in front of it,
 or something behind it. Poses in which solid objects overlap are improbable.
 
-The result depends on the set of views, not on their order. The comparison of a pose with a view is computed once and
-cached (:mod:`.memo`), so the cost of a new view does not grow with the number of views before it.
+The result depends on the set of views. It does not depend on their order, unless poses of cameras are corrected
+(:mod:`.camera_alignment`). The comparison of a pose with a view is computed once and cached (:mod:`.memo`), so the cost
+of a new view does not grow with the number of views before it.
 """
 
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from active6d_perception.model.visible_samples import VisibleSamples
 from active6d_perception.scene.belief_weights import BeliefWeights, belief_path, load_belief
 from active6d_perception.scene.body_candidates import BodyCandidates, gather_candidates, merge_duplicates
 from active6d_perception.scene.body_refinement import BodyRefinement
+from active6d_perception.scene.camera_alignment import CameraAlignment
 from active6d_perception.scene.clustering import cluster
 from active6d_perception.scene.expected_visibility import Tray
 from active6d_perception.scene.feasibility import against_container, against_neighbour, combine_neighbours
@@ -94,6 +96,7 @@ class JointFusion:
         parameters: settings shared with :class:`.SceneFusion`.
         weights: of the belief; those of the object when None.
         tray: floor and walls; those of the object's usual bin when None.
+        align: whether poses of cameras are corrected, see :mod:`.camera_alignment`.
     """
 
     def __init__(
@@ -102,8 +105,11 @@ class JointFusion:
         parameters: FusionParameters | None = None,
         weights: BeliefWeights | None = None,
         tray: Tray | None = None,
+        *,
+        align: bool = True,
     ) -> None:
         self.parameters = parameters or FusionParameters()
+        self._align, self.cameras = align, CameraAlignment()
         self.ambiguity: Ambiguity = ambiguity_of(model)
         self.weights = weights or load_belief(belief_path(model.name))
         self._tray = tray or Tray.for_model(model)
@@ -133,11 +139,13 @@ class JointFusion:
         """Forget all views."""
         self._known.reset()
         self._views: dict[int, _SeenView] = {}
+        self.cameras.reset()
         self._feasible = Memo()
 
     def forget_before(self, stamp: int) -> None:
         """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
         self._known.forget_before(stamp)
+        self.cameras.forget_before(stamp)
         self._views = {known: self._views[known] for known in self._known.stamps}
 
     def add_view(
@@ -166,8 +174,11 @@ class JointFusion:
         measured: MeasuredView,
     ) -> bool:
         """:meth:`add_view` for a view that has been reduced by :func:`.measure_view`."""
-        if not self._known.add_view(stamp, T_world_camera, hypotheses, verification):
+        if stamp in self._views:
             return False
+        if self._align:
+            measured = self.cameras.add_view(stamp, measured)
+        self._known.add_view(stamp, invert(measured.T_camera_world), hypotheses, verification)
         self._views[stamp] = _SeenView(measured, Memo())
         return True
 
@@ -302,7 +313,8 @@ class JointFusion:
         first = first[probability[first] >= self.parameters.least_probability]
         apart_enough = self.parameters.exclusion * ambiguity.diameter
         kept = first[suppress_neighbours(T[first, :3, 3][None], np.ones((1, len(first)), bool), apart_enough)[0]]
-        box, depth = project_features(ambiguity.views, invert(T_world_camera) @ T[kept], camera)
+        T_camera_anchor = invert(self.cameras.alignment(stamp).correction @ T_world_camera)
+        box, depth = project_features(ambiguity.views, T_camera_anchor @ T[kept], camera)
         columns = []
         for row, own in enumerate(members[kept]):
             mine = np.flatnonzero(own)
@@ -312,7 +324,7 @@ class JointFusion:
             columns.append((*table[mine[0], :2], len(np.unique(stamps[mine])), apart[kept[row], mine].max()))
         verification, score, support, spread = np.array(columns).reshape(-1, 4).T
         objects = SceneObjects(
-            T[kept],
+            self.cameras.T_world_anchor @ T[kept],
             verification,
             score,
             box,

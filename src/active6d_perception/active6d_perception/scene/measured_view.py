@@ -72,6 +72,12 @@ def measure_view(
     return MeasuredView(z, _normals(z, intrinsics), instance, middles, invert(T_world_camera), *intrinsics)
 
 
+def move_view(view: MeasuredView, T_world_camera: np.ndarray) -> MeasuredView:
+    """The same view from another (4, 4) pose of the camera; what is in the camera's frame stays."""
+    middles = transform_points(T_world_camera @ view.T_camera_world, view.middles)
+    return view._replace(T_camera_world=invert(T_world_camera), middles=middles)
+
+
 @compiled
 def _normals(depth: np.ndarray, intrinsics: tuple[float, float, float, float]) -> np.ndarray:
     """(h, w, 3) int8 normals, as :func:`active6d_core.camera.normals_from_points` over one pixel."""

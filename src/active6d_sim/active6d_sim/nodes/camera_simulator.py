@@ -12,6 +12,7 @@ from active6d_core.registry import AUTOMATIC
 from active6d_core.ros.runner import run_node
 from active6d_core.se3 import quaternion_from_transform
 from active6d_sim.nodes.moving_camera import MovingCameraNode
+from active6d_sim.rendering.pose_error import PoseError
 from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.sensor_registry import list_sensors
 from active6d_sim.rendering.simulator import GoalError, Simulator, admit_goal
@@ -29,6 +30,8 @@ class CameraSimulatorNode(MovingCameraNode):
         sensors = [AUTOMATIC, *list_sensors()]
         self.declare("sensor", AUTOMATIC, "sensor model; auto: active_stereo, in wild scenes random", choices=sensors)
         self.declare("noise_scale", 1.0, "factor on the sensor noise; 0: no noise", minimum=0.0)
+        self.declare("pose_error_mm", 0.0, "error of each view's pose, root mean square in millimetres", minimum=0.0)
+        self.declare("pose_error_degrees", 0.0, "error of each view's pose, root mean square in degrees", minimum=0.0)
         self.declare("width", 640, "image width in pixels", minimum=16, maximum=4096)
         self.declare("height", 480, "image height in pixels", minimum=16, maximum=4096)
         self.declare("field_of_view", 60.0, "horizontal field of view in degrees", minimum=5.0, maximum=150.0)
@@ -51,6 +54,7 @@ class CameraSimulatorNode(MovingCameraNode):
         super().setup()
         self.check_start_view(len(self.sphere))
         self._T_calibrated_true = np.eye(4)
+        self._pose_error = PoseError(self.value("pose_error_mm"), self.value("pose_error_degrees"))
         self._arm: CameraArm | None = None
         self._motion: Motion | None = None
         if self.value("carrier") == "arm":
@@ -113,8 +117,10 @@ class CameraSimulatorNode(MovingCameraNode):
         return self._motion.seconds
 
     def capture(self, T_world_camera: np.ndarray, stamp: int) -> View:
-        """What the sensor sees from there; with an arm, from beside it by the error of the calibration."""
-        view = self._simulator.capture(T_world_camera @ self._T_calibrated_true, stamp)
+        """What the sensor sees from there, or from beside it by the errors of the pose and of an arm's calibration."""
+        rng = np.random.default_rng([self.seed, self._simulator.scene.seed, stamp])
+        T_said_true = self._T_calibrated_true @ self._pose_error.draw(rng)
+        view = self._simulator.capture(T_world_camera @ T_said_true, stamp)
         return replace(view, T_world_camera=T_world_camera)
 
     def _on_next_scene(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -11,7 +11,8 @@ from active6d_core.registry import AUTOMATIC
 from active6d_perception.estimators.detection_rates import area_under_curve, calibration_error
 from active6d_perception.scene.fusion import FusionParameters, SceneFusion
 from active6d_perception.scene.joint_fusion import JointFusion
-from active6d_tools.processed_scene import RING_VIEWS, PoseError, ProcessedScene, ProcessedView, add_view
+from active6d_sim.rendering.pose_error import PoseError
+from active6d_tools.processed_scene import RING_VIEWS, ProcessedScene, ProcessedView, add_view, disturb
 
 #: The views of an episode: six evenly on a ring at 45 degrees, six at random, or all of the grid.
 KINDS = ("ring", "random", "all")
@@ -84,7 +85,8 @@ def compare_methods(
         estimator: name of the deployed one.
         seed: of the views and of the sensor's noise.
         parameters: of the fusion.
-        pose_error: of the camera's poses; none when None.
+        pose_error: of the camera's poses; none when None. With errors, fusion of all views is also measured without
+            aligning the views, as "not aligned".
         on_progress: called with a scene's name, the number of scenes done and that of all.
 
     Returns:
@@ -99,9 +101,11 @@ def compare_methods(
             "best-view": SceneFusion(processed.model, parameters),
             "all-views": JointFusion(processed.model, parameters),
         }
+        if pose_error != PoseError():
+            methods["not aligned"] = JointFusion(processed.model, parameters, align=False)
         rng = np.random.default_rng([seed + 1, int(name.split("/")[-1])])
         for kind, exact in _draw_episodes(processed, kinds, episodes, rng):
-            views = [pose_error.disturb(view, rng) for view in exact]
+            views = [disturb(view, pose_error, rng) for view in exact]
             for method, fusion in methods.items():
                 result = results[kind].setdefault(method, MethodResults(processed.model.diameter))
                 _fuse(fusion, views, result, processed)

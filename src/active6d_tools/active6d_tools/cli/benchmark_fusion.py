@@ -51,9 +51,9 @@ def fusion(
     """
     from active6d_core.object_model import load_object
     from active6d_perception.scene.fusion import FusionParameters
+    from active6d_sim.rendering.pose_error import PoseError
     from active6d_sim.scenes.scene_store import SPLITS, load_scene
     from active6d_tools.benchmark.fusion_methods import KINDS, compare_methods
-    from active6d_tools.processed_scene import PoseError
 
     chosen = [kind.strip() for kind in kinds.split(",")]
     if unknown := set(chosen) - set(KINDS):
