@@ -57,6 +57,7 @@ class HypothesisFusionNode(GraphNode):
         self.declare("epsilon", 0.010, "depth threshold of the verification score in metres", minimum=1e-4)
         self.declare("samples", 128, "largest number of scene points verified per hypothesis", minimum=1)
         self._declare_fusion()
+        self._declare_bin()
         self._declare_workspace()
         self._objects = self.output(topics.OBJECTS)
         self._poses = self.output(topics.OBJECTS_POSES)
@@ -95,13 +96,6 @@ class HypothesisFusionNode(GraphNode):
             True,
             "correct the camera's poses by aligning the depth images of the views; only by the method all-views",
         )
-        self.declare("bin_width", 0.0, "between the bin's inner walls, metres; 0: that of the usual bin", minimum=0.0)
-        self.declare(
-            "wall_height",
-            -1.0,
-            "of the bin's walls above its floor at z = 0, metres; 0: an open table, -1: that of the usual bin",
-            minimum=-1.0,
-        )
         self.declare(
             "cut", usual.cut, "distance at which clusters are cut, as a fraction of the object's diameter", minimum=1e-3
         )
@@ -131,6 +125,15 @@ class HypothesisFusionNode(GraphNode):
             "value leaves surface of found objects unexplained where poses are slightly off",
             minimum=1e-3,
             maximum=1.0,
+        )
+
+    def _declare_bin(self) -> None:
+        self.declare("bin_width", 0.0, "between the bin's inner walls, metres; 0: that of the usual bin", minimum=0.0)
+        self.declare(
+            "wall_height",
+            -1.0,
+            "of the bin's walls above its floor at z = 0, metres; 0: an open table, -1: that of the usual bin",
+            minimum=-1.0,
         )
 
     def _declare_workspace(self) -> None:
