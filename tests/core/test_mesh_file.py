@@ -5,7 +5,7 @@ import pytest
 import trimesh
 import yaml
 
-from active6d_core.mesh_file import close_mesh, load_mesh
+from active6d_core.mesh_file import close_mesh, load_mesh, mesh_notes
 from active6d_core.object_model import read_description
 
 BOX = trimesh.creation.box((0.08, 0.06, 0.04))
@@ -91,3 +91,19 @@ def test_points_and_broken_numbers_are_refused(tmp_path):
 def test_a_stray_vertex_does_not_make_the_object_large(tmp_path):
     mesh = trimesh.Trimesh(np.vstack([BOX.vertices, [[10, 10, 10]]]), BOX.faces, process=False)
     assert read_description(describe(tmp_path, mesh)).diameter == pytest.approx(0.1077, rel=1e-3)
+
+
+def test_what_of_a_file_is_used_otherwise_than_expected_is_said(tmp_path):
+    two = trimesh.util.concatenate(
+        [trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 1, 1)).apply_translation((3, 0, 0))]
+    )
+    two.export(tmp_path / "two.stl")
+    (note,) = mesh_notes(tmp_path / "two.stl")
+    assert "2 separate bodies" in note
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "one.obj")
+    plain = (tmp_path / "one.obj").read_text()
+    (tmp_path / "plain.obj").write_text("".join(line for line in plain.splitlines(True) if "mtl" not in line))
+    assert mesh_notes(tmp_path / "plain.obj") == []
+    (tmp_path / "painted.obj").write_text(f"mtllib painted.mtl\n{plain}")
+    (note,) = mesh_notes(tmp_path / "painted.obj")
+    assert "textures of the file are not used" in note

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -90,3 +91,17 @@ def test_errors_name_their_cause(scene, tmp_path, arguments, cause):
     run = CliRunner().invoke(app, ["estimate", "--object", "coffee_cup", *arguments, "--out", str(tmp_path)])
     assert run.exit_code == 2
     assert cause in run.stderr
+
+
+def test_an_image_that_cannot_be_used_is_left_out_and_told(scene, tmp_path):
+    copy = tmp_path / "000007"
+    shutil.copytree(scene, copy)
+    Image.fromarray(np.zeros((480, 640), np.uint16)).save(copy / "depth" / "000000.png")
+    out, told = tmp_path / "out", tmp_path / "told.json"
+    options = ["--object", "coffee_cup", "--out", str(out), "--json", str(told)]
+    run = CliRunner().invoke(app, ["estimate", str(copy), *options])
+    assert run.exit_code == 1
+    assert {row["im_id"] for row in rows(out / "results.csv")} == {"1"}
+    (reason,) = json.loads(told.read_text())["left_out"]
+    assert reason.startswith("image 0 is left out: depth has no valid pixel")
+    assert reason in " ".join(run.stderr.split())

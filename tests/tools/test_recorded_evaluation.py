@@ -21,6 +21,7 @@ from active6d_sim.datasets.bop_export import write_model
 from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import load_scene
+from active6d_tools.bop_results import BopEstimates, once_per_image
 from active6d_tools.cli import app
 from active6d_tools.direct_episode import Perception
 from active6d_tools.recorded_scene import RecordedScene, find_bin, turn_boxes
@@ -215,3 +216,63 @@ def test_a_folder_without_scenes_is_refused(tmp_path):
     result = run("--bop", tmp_path)
     assert result.exit_code == 2
     assert "must be a data set in BOP's format" in " ".join(result.output.split())
+
+
+def copied(dataset, folder, change):
+    """The scene with files that ``change(copy)`` replaces."""
+    copy = folder / "000003"
+    copy.mkdir()
+    for path in (dataset / "test" / "000003").iterdir():
+        (copy / path.name).symlink_to(path)
+    for name, content in change(copy).items():
+        (copy / name).unlink()
+        if content is not None:
+            (copy / name).write_text(json.dumps(content))
+    return copy
+
+
+def another_object(copy):
+    truth = json.loads((copy / "scene_gt.json").read_text())
+    truth["0"][0]["obj_id"] = 2
+    return {"scene_gt.json": truth}
+
+
+def no_truth(copy):
+    return {"scene_gt.json": None, "scene_gt_info.json": None}
+
+
+def wrong_scale(copy):
+    cameras = json.loads((copy / "scene_camera.json").read_text())
+    return {"scene_camera.json": {image: {**entry, "depth_scale": 10.0} for image, entry in cameras.items()}}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (another_object, "has objects 1, 2; choose with --object-id"),
+        (no_truth, "policies need ground truth to be scored"),
+        (wrong_scale, "would span"),
+    ],
+)
+def test_a_scene_that_cannot_be_scored_is_refused_before_it_is_estimated(dataset, tmp_path, change, reason):
+    result = run("--bop", copied(dataset, tmp_path, change), "--policies", "random")
+    assert result.exit_code == 2
+    assert reason in " ".join(result.output.split())
+
+
+def test_scenes_of_several_splits_are_not_mixed(dataset, tmp_path):
+    for split in ("test", "train_pbr"):
+        (tmp_path / split).mkdir()
+        (tmp_path / split / "000003").symlink_to(dataset / "test" / "000003")
+    result = run("--bop", tmp_path, "--policies", "random")
+    assert result.exit_code == 2
+    assert "has scenes in test, train_pbr; name one of these folders" in " ".join(result.output.split())
+
+
+def test_a_results_file_has_each_image_once():
+    def estimates(scene, image, seconds):
+        return BopEstimates(scene, image, np.eye(4)[None], np.ones(1), seconds)
+
+    kept, others = once_per_image([estimates(1, 5, 0.1), estimates(1, 6, 0.2), estimates(1, 5, 0.3)])
+    assert [(each.image_id, each.seconds) for each in kept] == [(5, 0.1), (6, 0.2)]
+    assert others == 1

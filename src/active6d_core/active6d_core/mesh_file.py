@@ -1,6 +1,7 @@
 """Triangle meshes as users bring them: loaded, repaired where that is safe, else refused with the likely cause."""
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,11 @@ from active6d_core.mesh_limits import check_counts, read_limited
 PLAUSIBLE_DIAMETER = (0.002, 2.0)
 #: Faces of a mesh that is repaired; the repair takes seconds each time that a mesh is loaded.
 _MOST_REPAIRED = 100_000
+#: Separate bodies; more are the crumbs of a scan.
+_MOST_BODIES = 20
+#: What announces colours in OBJ, GLB and PLY, and how far a file is searched for it.
+_MATERIALS = (rb"^mtllib ", rb'"materials"\s*:', rb"^comment TextureFile", rb"^property uchar (red|texture)")
+_MARKED = 2**20
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres": 1.0}
 
 
@@ -39,6 +45,21 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         raise ValueError(f"mesh {path.name} has vertices that are not finite")
     mesh.remove_unreferenced_vertices()
     return mesh
+
+
+def mesh_notes(path: Path) -> list[str]:
+    """What of a mesh file is used in another way than a user may expect, in words; empty for most files.
+
+    Raises:
+        ValueError: see :func:`load_mesh`.
+    """
+    mesh, content, notes = load_mesh(path), path.read_bytes(), []
+    bodies = len(trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces))))
+    if 1 < bodies <= _MOST_BODIES and mesh.is_watertight:
+        notes.append(f"the file holds {bodies} separate bodies; they are taken as one rigid object")
+    if any(re.search(mark, content[:_MARKED], re.MULTILINE) for mark in _MATERIALS):
+        notes.append("colours and textures of the file are not used; --color sets one colour")
+    return notes
 
 
 def close_mesh(mesh: trimesh.Trimesh) -> list[str]:

@@ -53,7 +53,7 @@ def check_counts(name: str, vertices: int, faces: int) -> None:
     if not (0 <= vertices <= MOST_VERTICES and 0 <= faces <= MOST_FACES):
         raise ValueError(
             f"mesh {name} announces {vertices} vertices and {faces} faces; at most {MOST_VERTICES} and {MOST_FACES} "
-            "are read; simplify it"
+            "are read; simplify it in a mesh editor, such as MeshLab"
         )
 
 

@@ -23,6 +23,8 @@ SHIPPED_OBJECTS = Path(__file__).parent / "objects"
 _REQUIRED = {"name", "instances", "color"}
 _OPTIONAL = {"mesh", "profile", "scale", "symmetry", "features", "source"}
 _LARGEST_GROUP = 120
+#: Coordinates of rotations that count as the same; data sets round theirs.
+_SAME_ROTATION = 1e-3
 #: If set, a description may name a mesh outside of its own folder.
 ALLOW_OUTSIDE_VARIABLE = "ACTIVE6D_ALLOW_OUTSIDE"
 _MOST_INSTANCES, _MOST_PROFILE_ROWS, _MOST_FEATURES = 200, 1000, 100
@@ -311,7 +313,7 @@ def _generate_group(generators: np.ndarray) -> np.ndarray:
     while True:
         products = np.concatenate([group, (generators[:, None] @ group).reshape(-1, 3, 3)])
         distance = np.abs(products[:, None] - products).max(axis=(2, 3))
-        is_new = ~(np.tril(distance < 1e-6, k=-1)).any(axis=1)
+        is_new = ~(np.tril(distance < _SAME_ROTATION, k=-1)).any(axis=1)
         if is_new.sum() == len(group):
             return group
         group = products[is_new]

@@ -8,7 +8,7 @@ import numpy as np
 from active6d_core.camera import PinholeCamera
 from active6d_core.depth_cameras import depth_camera, without_flying_pixels
 from active6d_core.hypotheses import Hypotheses
-from active6d_core.object_model import load_object
+from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.registry import AUTOMATIC
 from active6d_core.rgbd import crop_depth, make_view
 from active6d_perception.estimators.registry import create_estimator
@@ -75,7 +75,7 @@ class Active6D:
         """
         kind = None if sensor is None else depth_camera(sensor)
         view = make_view(rgb, depth, camera, depth_scale=depth_scale, T_world_camera=T_world_camera)
-        self._check_size(np.nanmedian(view.depth), view.camera)
+        check_span(self.model, view.depth, view.camera)
         if kind is not None:
             depth_range = depth_range or kind.depth_range
             if kind.flying_pixels:
@@ -83,11 +83,22 @@ class Active6D:
         view = crop_depth(view, depth_range, region, region_in_world=T_world_camera is not None)
         return self._estimator.estimate(view).ranked()
 
-    def _check_size(self, distance: float, camera: PinholeCamera) -> None:
-        """Refuse views in which an object would be a speck or far larger than the image."""
-        pixels = self.model.diameter * camera.fx / distance
-        if not _SMALLEST < pixels < _LARGEST * max(camera.width, camera.height):
-            raise ValueError(
-                f"at {distance:.3g} m, {self.model.name} ({1e3 * self.model.diameter:.0f} mm) would span {pixels:.0f} "
-                f"pixels of {camera.width}; check depth_scale, K and the unit of the mesh"
-            )
+
+def check_span(model: ObjectModel, depth: np.ndarray, camera: PinholeCamera) -> None:
+    """Check that an object at the distance that most of an image shows is no speck and not far larger than the image.
+
+    Args:
+        model: the object.
+        depth: (H, W) metres, NaN where invalid.
+        camera: intrinsics.
+
+    Raises:
+        ValueError: it is; the message has the numbers.
+    """
+    distance = float(np.nanmedian(depth))
+    pixels = model.diameter * camera.fx / distance
+    if not _SMALLEST < pixels < _LARGEST * max(camera.width, camera.height):
+        raise ValueError(
+            f"at {distance:.3g} m, {model.name} ({1e3 * model.diameter:.0f} mm) would span {pixels:.0f} "
+            f"pixels of {camera.width}; check depth_scale, K and the unit of the mesh"
+        )

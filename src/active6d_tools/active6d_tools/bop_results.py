@@ -32,6 +32,16 @@ class BopEstimates:
     seconds: float
 
 
+def once_per_image(estimates: Iterable[BopEstimates]) -> tuple[list[BopEstimates], int]:
+    """The first estimates of each image, and how many others there were: BOP scores an image once."""
+    first: dict[tuple[int, int], BopEstimates] = {}
+    others = 0
+    for each in estimates:
+        others += (each.scene_id, each.image_id) in first
+        first.setdefault((each.scene_id, each.image_id), each)
+    return list(first.values()), others
+
+
 def bop_csv(estimates: Iterable[BopEstimates], model: ObjectModel, object_id: int) -> str:
     """Results as BOP's CSV: poses of the mesh file's frame in the camera, millimetres."""
     file = io.StringIO()

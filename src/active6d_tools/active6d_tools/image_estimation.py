@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,15 +49,22 @@ class ImageResult:
         return BopEstimates(self.scene_id, self.image_id, found.T_camera_object, found.score, self.seconds)
 
 
-def read_scene(folder: Path, needs_poses: bool = False) -> tuple[int, list[tuple[int, View]]]:
+#: A numbered image, which is read when it is needed: scenes of data sets have thousands.
+NumberedImage = tuple[int, Callable[[], View]]
+
+
+def read_scene(folder: Path, needs_poses: bool = False) -> tuple[int, list[NumberedImage]]:
     """The scene's number and the numbered views of a BOP scene folder, with or without camera poses.
 
     Raises:
-        ValueError: the folder is no BOP scene, or an image is damaged; the message names the file.
+        ValueError: the folder is no BOP scene; the message names the file.
     """
     scene = BopScene.load(folder, needs_poses)
     name = folder.resolve().name
-    return int(name) if name.isdecimal() else 0, [(image, scene.view(i, 0)) for i, image in enumerate(scene.image_ids)]
+    images: list[NumberedImage] = [
+        (image, partial(scene.view, index, 0)) for index, image in enumerate(scene.image_ids)
+    ]
+    return int(name) if name.isdecimal() else 0, images
 
 
 def read_image(rgb: Path, depth: Path, intrinsics: Path, depth_scale: float | None) -> View:
@@ -82,21 +90,34 @@ def read_image(rgb: Path, depth: Path, intrinsics: Path, depth_scale: float | No
 def estimate_images(
     estimator: Active6D,
     scene_id: int,
-    images: Sequence[tuple[int, View]],
+    images: Sequence[NumberedImage],
     *,
     depth_range: tuple[float, float] | None = None,
     region: tuple[np.ndarray, np.ndarray] | None = None,
     region_in_world: bool = False,
     sensor: str | None = None,
+    on_left_out: Callable[[str], None] = lambda text: None,
 ) -> Iterator[ImageResult]:
     """Run the estimator on numbered views; yields each result. For the other arguments see :class:`.Active6D`.
 
+    Args:
+        estimator: of the object.
+        scene_id: BOP's number of the scene.
+        images: to estimate.
+        depth_range: metres.
+        region: corners of a box, metres.
+        region_in_world: the box is in the world frame.
+        sensor: kind of depth camera.
+        on_left_out: called with the number of an image that cannot be used, and why.
+
     Raises:
-        ValueError: a view cannot be used; the message has the image's number.
+        ValueError: no image can be used; the message has the first one's number.
     """
-    for image_id, view in images:
-        started = time.perf_counter()
+    first_problem, used = "", False
+    for image_id, read in images:
         try:
+            view = read()
+            started = time.perf_counter()
             found = estimator(
                 view.color,
                 view.depth,
@@ -107,8 +128,13 @@ def estimate_images(
                 T_world_camera=view.T_world_camera if region_in_world else None,
             )
         except ValueError as error:
-            raise ValueError(f"image {image_id}: {error}") from error
+            first_problem = first_problem or f"image {image_id}: {error}"
+            on_left_out(f"image {image_id} is left out: {error}")
+            continue
+        used = True
         yield ImageResult(scene_id, image_id, view, found, time.perf_counter() - started)
+    if not used:
+        raise ValueError(first_problem)
 
 
 def describe(results: Sequence[ImageResult], model: ObjectModel) -> list[dict[str, Any]]:

@@ -17,7 +17,8 @@ from active6d_core.metrics import evaluate_scene
 from active6d_core.object_model import ObjectModel
 from active6d_core.registry import AUTOMATIC
 from active6d_core.se3 import invert
-from active6d_sim.datasets.bop import CAMERA_FILE, BopScene
+from active6d_perception.active6d import check_span
+from active6d_sim.datasets.bop import CAMERA_FILE, TRUTH_FILE, BopScene
 from active6d_tools.bop_results import BopEstimates
 from active6d_tools.direct_episode import DirectEpisode, DirectRunner, Perception
 from active6d_tools.recorded_scene import RecordedCamera, RecordedScene, find_bin
@@ -36,6 +37,10 @@ def scene_folders(folder: Path) -> list[Path]:
     """
     for pattern in (CAMERA_FILE, f"*/{CAMERA_FILE}", f"*/*/{CAMERA_FILE}"):
         found = sorted(path.parent for path in folder.glob(pattern))
+        splits = sorted({scene.parent for scene in found})
+        if len(splits) > 1:
+            names = ", ".join(split.name for split in splits)
+            raise ValueError(f"{folder}: has scenes in {names}; name one of these folders")
         if found:
             return found
     raise ValueError(f"{folder}: no {CAMERA_FILE} in it or in its subfolders; it must be a data set in BOP's format")
@@ -75,8 +80,12 @@ class RecordedEvaluation:
         self.scenes = []
         for folder in folders:
             recording = BopScene.load(folder, needs_poses=False)
+            _check(recording, model, object_id)
             placed = _place(recording, model, perception, warn)
             self.scenes.append(RecordedScene(placed, model, object_id, perception, find_bin(placed, model, warn)))
+        ids = {int(each) for scene in self.scenes for image in scene.recording.truth or () for each in image.object_id}
+        #: BOP's number of the object.
+        self.object_id = object_id or min(ids)
         self._truths = [scene.truth() for scene in self.scenes]
         self.starts = np.array(
             [
@@ -128,6 +137,23 @@ class RecordedEvaluation:
         return np.array([of_image[int(i)] for i in scene.nearest])
 
 
+def _check(recording: BopScene, model: ObjectModel, object_id: int | None) -> None:
+    """Raise ValueError where a recording cannot be scored, before its images are estimated."""
+    if recording.truth is None:
+        raise ValueError(f"{recording.folder / TRUTH_FILE}: no such file; policies need ground truth to be scored")
+    known = sorted({int(each) for image in recording.truth for each in image.object_id})
+    if object_id is None and len(known) > 1:
+        raise ValueError(f"{recording.folder}: has objects {', '.join(map(str, known))}; choose with --object-id")
+    if object_id is not None and object_id not in known:
+        raise ValueError(f"{recording.folder}: no ground truth of object {object_id}, only of {known}")
+    view = recording.view(0, 0)
+    if np.isfinite(view.depth).any():
+        try:
+            check_span(model, view.depth, view.camera)
+        except ValueError as error:
+            raise ValueError(f"{recording.folder}: {error}") from error
+
+
 def _estimates(scene: RecordedScene, episode: DirectEpisode, camera: RecordedCamera) -> BopEstimates:
     objects, index = episode.objects[-1], camera.taken[-1]
     name = scene.recording.folder.resolve().name
@@ -151,7 +177,10 @@ def _place(recording: BopScene, model: ObjectModel, perception: Perception, warn
         return recording
     folder = recording.folder
     if not all(missing):
-        raise ValueError(f"{folder}: {sum(missing)} of {len(missing)} images have no camera pose")
+        raise ValueError(
+            f"{folder}: {sum(missing)} of {len(missing)} images have no camera pose; remove these images from "
+            f"{CAMERA_FILE}, or all poses: then images are placed by the objects in them"
+        )
     centres = []
     for index in range(len(recording)):
         found = perception(recording.view(index, index + 1)).hypotheses

@@ -203,7 +203,9 @@ def _read_by_image(path: Path) -> dict[int, Any]:
     try:
         content = read_json(path)
     except FileNotFoundError as error:
-        raise ValueError(f"{path}: no such file; a BOP scene folder needs it") from error
+        cameras = sorted(each.name for each in path.parent.glob(f"{path.stem}_*.json"))
+        several = f"; it has {', '.join(cameras)}: copy one camera's files to the usual names" if cameras else ""
+        raise ValueError(f"{path}: no such file; a BOP scene folder needs it{several}") from error
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not a JSON file ({error})") from error
     if not isinstance(content, dict) or not all(key.isascii() and key.isdecimal() for key in content):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,8 +12,7 @@ from active6d_tools.cli.output import write_json, write_png
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
-    from active6d_core.camera import View
-    from active6d_tools.image_estimation import ImageResult, Overlay
+    from active6d_tools.image_estimation import ImageResult, NumberedImage, Overlay
 
 _SENSOR = (
     "Kind of depth camera: active_stereo, structured_light or time_of_flight. It sets --range where that is not given, "
@@ -51,7 +50,7 @@ def estimate(
     """Estimate the poses of an object in recorded images.
 
     Writes DIR/results.csv, a BOP results file with poses of the mesh file's frame in millimetres, and an overlay PNG of
-    every image.
+    every image. Exits with code 1 if an image cannot be used.
 
     Example: [bold]active6d estimate path/to/bop/scene --object coffee_cup --range 0.3 1.2 --out estimates[/bold]
     """
@@ -67,20 +66,19 @@ def estimate(
     box = (np.array(region[:3]), np.array(region[3:])) if region is not None else None
     with messages.status(f"loading the estimator of {object_name}"):
         finder = Active6D(object_name, estimator)
-    found = estimate_images(
-        finder,
-        scene_id,
-        images,
-        depth_range=depth_range,
-        region=box,
-        region_in_world=region_in_world,
-        sensor=sensor,
-    )
+    left_out: list[str] = []
+    crop: dict[str, Any] = {"depth_range": depth_range, "region": box, "region_in_world": region_in_world}
+    found = estimate_images(finder, scene_id, images, **crop, sensor=sensor, on_left_out=left_out.append)
     results = _draw_each(found, len(images), Overlay(finder.model), out / "overlays", min_score)
     _print(results, min_score)
     write_file(out / "results.csv", bop_csv((result.bop for result in results), finder.model, object_id))
     messages.print(f"wrote {out / 'results.csv'} and {out / 'overlays'}", highlight=False, markup=False)
-    write_json(json_file, {"object": object_name, "estimator": estimator, "images": describe(results, finder.model)})
+    for text in left_out:
+        messages.print(text, highlight=False, markup=False)
+    report = {"object": object_name, "estimator": estimator, "images": describe(results, finder.model)}
+    write_json(json_file, {**report, "left_out": left_out})
+    if left_out:
+        raise typer.Exit(1)
 
 
 def _draw_each(
@@ -110,8 +108,8 @@ def _read(
     intrinsics: Path | None,
     depth_scale: float | None,
     needs_poses: bool,
-) -> tuple[int, list[tuple[int, "View"]]]:
-    """BOP scene id, and views with their BOP image ids."""
+) -> tuple[int, list["NumberedImage"]]:
+    """BOP scene id, and images with their BOP image ids."""
     from active6d_tools.image_estimation import read_image, read_scene
 
     single = (rgb, depth, intrinsics)
@@ -121,4 +119,5 @@ def _read(
         return read_scene(folder, needs_poses)
     if rgb is None or depth is None or intrinsics is None:
         raise ValueError("give a scene folder in BOP format, or all of --rgb, --depth and --intrinsics")
-    return 0, [(0, read_image(rgb, depth, intrinsics, depth_scale))]
+    view = read_image(rgb, depth, intrinsics, depth_scale)
+    return 0, [(0, lambda: view)]

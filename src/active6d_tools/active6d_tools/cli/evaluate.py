@@ -118,7 +118,7 @@ def _evaluate_recorded(
 ) -> None:
     from active6d_agent.evaluation.policy_evaluation import summarise
     from active6d_core.object_model import load_object
-    from active6d_tools.bop_results import bop_csv
+    from active6d_tools.bop_results import bop_csv, once_per_image
     from active6d_tools.recorded_evaluation import RecordedEvaluation, scene_folders
 
     model, folders = load_object(object_name), scene_folders(folder)
@@ -134,9 +134,10 @@ def _evaluate_recorded(
         with work_progress() as on_progress:
             results[name], estimates = evaluation.run(name, parameters.get(name, {}), on_progress)
         if csv is not None:
-            path = csv / f"{name}_{folder.resolve().name}-test.csv"
-            write_file(path, bop_csv(estimates, model, settings["object_id"] or 1))
-            warn(f"wrote {path}")
+            path, (written, others) = csv / f"{name}_{folder.resolve().name}-test.csv", once_per_image(estimates)
+            write_file(path, bop_csv(written, model, evaluation.object_id))
+            left_out = f"; {others} episodes that ended at an image of another one are not in it" if others else ""
+            warn(f"wrote {path}{left_out}")
     summary = summarise(results, object_name, settings["steps"], settings["seed"])
     _print_policies(summary)
     episodes = {name: {key: own.measures[key].tolist() for key in own.measures} for name, own in results.items()}

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from active6d_core.object_model import ObjectModel
+    from active6d_sim.datasets.bop_models import ModelSymmetry
 
+#: Share of the diameter by which a symmetry may move the centroid.
+_SHIFT = 0.02
 app = typer.Typer(help="Object models: list, show, add.", rich_markup_mode="rich")
 
 
@@ -100,7 +103,8 @@ def add(
 
     import yaml
 
-    from active6d_core.mesh_file import close_mesh, load_mesh
+    from active6d_core.mesh_file import close_mesh, load_mesh, mesh_notes
+    from active6d_sim.datasets.bop_models import symmetry_beside
 
     if not name.replace("_", "").replace("-", "").isalnum():
         raise ValueError(f"--name '{name}': use letters, digits, - and _")
@@ -111,17 +115,35 @@ def add(
         if path.exists():
             raise ValueError(f"{path} exists already; choose another --name or remove it")
     description = {"name": name, "mesh": f"meshes/{mesh_path.name}", "scale": scale}
+    notes = mesh_notes(mesh)
+    known = symmetry_beside(mesh) if axis is None else None
     if axis is not None:
         description["symmetry"] = {"axis": list(axis)}
+    elif known is not None:
+        description["symmetry"] = known.description
     description |= {"instances": list(instances), "color": list(color), "source": mesh.name}
     model = _store(mesh, mesh_path, description_path, yaml.safe_dump(description, sort_keys=False))
-    for repair in close_mesh(load_mesh(mesh)):
-        console.print(f"repaired each time it is loaded: {repair}", highlight=False, markup=False)
+    notes += [f"repaired each time it is loaded: {repair}" for repair in close_mesh(load_mesh(mesh))]
+    for note in notes + ([] if known is None else _symmetry_notes(known, model, scale)):
+        console.print(note, highlight=False, markup=False)
     size = " x ".join(f"{1e3 * extent:.1f}" for extent in model.mesh.extents)
     console.print(f"added {name}: {1e3 * model.diameter:.1f} mm in diameter ({size} mm)", highlight=False, markup=False)
     folders = os.environ.get("ACTIVE6D_OBJECT_PATH", "").split(os.pathsep)
     if str(into) not in folders and str(into.resolve()) not in folders:
         console.print(f"export ACTIVE6D_OBJECT_PATH={into.resolve()}", highlight=False, markup=False)
+
+
+def _symmetry_notes(known: "ModelSymmetry", model: "ObjectModel", scale: float) -> list[str]:
+    """What a user should know of symmetries that a data set names."""
+    from active6d_sim.datasets.bop_models import INFO_FILE
+
+    notes = [f"symmetry taken from {INFO_FILE}"]
+    if known.axes > 1:
+        notes.append(f"of its {known.axes} symmetry axes the first is used; an object has one")
+    shift = scale * known.shift(model.origin / scale)
+    if shift > _SHIFT * model.diameter:
+        notes.append(f"these symmetries move the centroid by {1e3 * shift:.1f} mm: are they of this mesh?")
+    return notes
 
 
 def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str) -> "ObjectModel":
@@ -136,7 +158,9 @@ def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str
     except Exception as error:  # readers of meshes raise many kinds on damaged files
         description_path.unlink(missing_ok=True)
         mesh_path.unlink()
-        raise ValueError(f"{mesh} cannot be added: {error}") from error
+        # The description is gone, and the copy is the user's file.
+        reason = str(error).removeprefix(f"{description_path}: ").replace(mesh_path.name, mesh.name)
+        raise ValueError(f"{mesh} cannot be added: {reason}") from error
 
 
 def _describe(model: "ObjectModel") -> dict[str, Any]:

@@ -1,0 +1,76 @@
+"""What a BOP data set says of its models: their symmetries, as those of an object's description."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from active6d_core.structured_text import read_json
+
+INFO_FILE = "models_info.json"
+#: Coordinates of a rotation that counts as one.
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSymmetry:
+    """Symmetries of one model.
+
+    Attributes:
+        description: of the keys ``axis`` and ``discrete_rotvec_degrees``, as in an object's description.
+        moves: (k, 4, 4) symmetry transforms in the file's frame and unit, those of an axis by half a turn.
+        axes: number of continuous axes; a description has one.
+    """
+
+    description: dict[str, Any]
+    moves: np.ndarray
+    axes: int
+
+    def shift(self, centre: np.ndarray) -> float:
+        """How far the symmetries move (3,) a point of the file's frame, in the file's unit."""
+        if not len(self.moves):
+            return 0.0
+        moved = self.moves[:, :3, :3] @ centre + self.moves[:, :3, 3]
+        return float(np.linalg.norm(moved - centre, axis=1).max())
+
+
+def symmetry_beside(mesh: Path) -> ModelSymmetry | None:
+    """Symmetries from ``models_info.json`` beside a model file ``obj_NNNNNN.ply``, None where it names none.
+
+    Raises:
+        ValueError: the entry is damaged; the message names the file and the model.
+    """
+    number, path = re.fullmatch(r"obj_(\d+)", mesh.stem), mesh.parent / INFO_FILE
+    if number is None or not path.is_file():
+        return None
+    key = str(int(number[1]))
+    try:
+        entry = read_json(path)[key]
+        continuous, discrete = entry.get("symmetries_continuous", []), entry.get("symmetries_discrete", [])
+        if not continuous and not discrete:
+            return None
+        moves = [np.array(each, float).reshape(4, 4) for each in discrete]
+        turns = [move[:3, :3] for move in moves]
+        if any(np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0 for R in turns):
+            raise ValueError("a discrete symmetry is not a rotation")
+        description: dict[str, Any] = {}
+        for each in continuous:
+            axis, offset = (np.array(each.get(name, [0, 0, 0]), float) for name in ("axis", "offset"))
+            if not np.linalg.norm(axis) > 0:
+                raise ValueError("the axis of a continuous symmetry is zero")
+            axis = axis / np.linalg.norm(axis)
+            description.setdefault("axis", axis.tolist())
+            half_turn, move = Rotation.from_rotvec(np.pi * axis).as_matrix(), np.eye(4)
+            move[:3, :3], move[:3, 3] = half_turn, offset - half_turn @ offset
+            moves.append(move)
+        if turns:
+            degrees = np.degrees(Rotation.from_matrix(np.array(turns)).as_rotvec())
+            description["discrete_rotvec_degrees"] = degrees.round(4).tolist()
+        if not np.isfinite(moves).all():
+            raise ValueError("a symmetry is not finite")
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: model {key}: {error or type(error).__name__}") from error
+    return ModelSymmetry(description, np.array(moves), len(continuous))
