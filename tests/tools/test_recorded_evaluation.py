@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from active6d_core.se3 import invert, make_transform, rotation_angle, transform_
 from active6d_perception.estimators.registry import register_estimator
 from active6d_sim.datasets.bop import BopScene, write_bop_scene
 from active6d_sim.datasets.bop_export import write_model
+from active6d_sim.datasets.bop_models import differs_from_data_set
 from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import load_scene
@@ -276,3 +278,12 @@ def test_a_results_file_has_each_image_once():
     kept, others = once_per_image([estimates(1, 5, 0.1), estimates(1, 6, 0.2), estimates(1, 5, 0.3)])
     assert [(each.image_id, each.seconds) for each in kept] == [(5, 0.1), (6, 0.2)]
     assert others == 1
+
+
+def test_a_data_set_with_another_mesh_or_frame_is_noticed(dataset, tmp_path):
+    scene = dataset / "test" / "000003"
+    assert differs_from_data_set(scene, 1, MODEL) == ""
+    assert "not model 1 of this data set" in differs_from_data_set(scene, 1, load_object("coffee_cup"))
+    moved = replace(MODEL, origin=MODEL.origin + [0.02, 0.0, 0.0])
+    assert "their bounds differ by 20 mm" in differs_from_data_set(scene, 1, moved)
+    assert differs_from_data_set(tmp_path / "test" / "000001", 1, MODEL) == ""

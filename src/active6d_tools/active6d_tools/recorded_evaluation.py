@@ -19,6 +19,7 @@ from active6d_core.registry import AUTOMATIC
 from active6d_core.se3 import invert
 from active6d_perception.active6d import check_span
 from active6d_sim.datasets.bop import CAMERA_FILE, TRUTH_FILE, BopScene
+from active6d_sim.datasets.bop_models import differs_from_data_set
 from active6d_tools.bop_results import BopEstimates
 from active6d_tools.direct_episode import DirectEpisode, DirectRunner, Perception
 from active6d_tools.recorded_scene import RecordedCamera, RecordedScene, find_bin
@@ -77,15 +78,16 @@ class RecordedEvaluation:
     ) -> None:
         self._model, self._steps, self._seed = model, steps, seed
         perception = Perception(model, estimator)
-        self.scenes = []
+        self.scenes: list[RecordedScene] = []
+        #: BOP's number of the object.
+        self.object_id = object_id or 1
         for folder in folders:
             recording = BopScene.load(folder, needs_poses=False)
-            _check(recording, model, object_id)
+            self.object_id = _check(recording, model, object_id)
+            if not self.scenes and (text := differs_from_data_set(folder, self.object_id, model)):
+                warn(text)
             placed = _place(recording, model, perception, warn)
             self.scenes.append(RecordedScene(placed, model, object_id, perception, find_bin(placed, model, warn)))
-        ids = {int(each) for scene in self.scenes for image in scene.recording.truth or () for each in image.object_id}
-        #: BOP's number of the object.
-        self.object_id = object_id or min(ids)
         self._truths = [scene.truth() for scene in self.scenes]
         self.starts = np.array(
             [
@@ -137,8 +139,8 @@ class RecordedEvaluation:
         return np.array([of_image[int(i)] for i in scene.nearest])
 
 
-def _check(recording: BopScene, model: ObjectModel, object_id: int | None) -> None:
-    """Raise ValueError where a recording cannot be scored, before its images are estimated."""
+def _check(recording: BopScene, model: ObjectModel, object_id: int | None) -> int:
+    """BOP's number of the object; ValueError where a recording cannot be scored, before its images are estimated."""
     if recording.truth is None:
         raise ValueError(f"{recording.folder / TRUTH_FILE}: no such file; policies need ground truth to be scored")
     known = sorted({int(each) for image in recording.truth for each in image.object_id})
@@ -152,6 +154,7 @@ def _check(recording: BopScene, model: ObjectModel, object_id: int | None) -> No
             check_span(model, view.depth, view.camera)
         except ValueError as error:
             raise ValueError(f"{recording.folder}: {error}") from error
+    return object_id or (known[0] if known else 1)
 
 
 def _estimates(scene: RecordedScene, episode: DirectEpisode, camera: RecordedCamera) -> BopEstimates:

@@ -8,9 +8,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from active6d_core.object_model import ObjectModel
 from active6d_core.structured_text import read_json
 
 INFO_FILE = "models_info.json"
+_MODEL_FOLDERS = ("models", "models_eval")
+#: Share of the diameter by which bounding boxes of the same model may differ.
+_SAME_BOUNDS = 0.03
 #: Coordinates of a rotation that counts as one.
 _ROTATION_TOLERANCE = 1e-3
 
@@ -74,3 +78,31 @@ def symmetry_beside(mesh: Path) -> ModelSymmetry | None:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: model {key}: {error or type(error).__name__}") from error
     return ModelSymmetry(description, np.array(moves), len(continuous))
+
+
+def differs_from_data_set(scene: Path, object_id: int, model: ObjectModel) -> str:
+    """What is wrong where a scene's data set has another mesh, or another frame, than an object; empty if nothing is.
+
+    Args:
+        scene: folder of the scene, within ``DATA_SET/SPLIT``.
+        object_id: BOP's number of the model.
+        model: the object whose poses are compared with the data set's.
+    """
+    folders = [parent / name for parent in list(scene.resolve().parents)[:3] for name in _MODEL_FOLDERS]
+    path = next((folder / INFO_FILE for folder in folders if (folder / INFO_FILE).is_file()), None)
+    if path is None:
+        return ""
+    try:
+        entry = read_json(path)[str(object_id)]
+        low = np.array([entry[f"min_{axis}"] for axis in "xyz"], float)
+        bounds = np.array([low, low + [entry[f"size_{axis}"] for axis in "xyz"]])
+    except (KeyError, TypeError, ValueError):  # the scene can be used without
+        return ""
+    apart = float(np.abs(bounds - 1e3 * (model.mesh.bounds + model.origin)).max())
+    if apart <= _SAME_BOUNDS * 1e3 * model.diameter:
+        return ""
+    mesh = path.parent / f"obj_{object_id:06d}.ply"
+    return (
+        f"the mesh of {model.name} is not model {object_id} of this data set, or in another frame: their bounds differ "
+        f"by {apart:.0f} mm, so poses differ too; use `active6d object add {mesh} --scale 0.001`"
+    )

@@ -12,6 +12,7 @@ from active6d_tools.cli.output import write_json, write_png
 from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
+    from active6d_perception.active6d import Active6D
     from active6d_tools.image_estimation import ImageResult, NumberedImage, Overlay
 
 _SENSOR = (
@@ -67,6 +68,7 @@ def estimate(
     with messages.status(f"loading the estimator of {object_name}"):
         finder = Active6D(object_name, estimator)
     left_out: list[str] = []
+    _print_model_difference(folder, object_id, finder)
     crop: dict[str, Any] = {"depth_range": depth_range, "region": box, "region_in_world": region_in_world}
     found = estimate_images(finder, scene_id, images, **crop, sensor=sensor, on_left_out=left_out.append)
     results = _draw_each(found, len(images), Overlay(finder.model), out / "overlays", min_score)
@@ -79,6 +81,13 @@ def estimate(
     write_json(json_file, {**report, "left_out": left_out})
     if left_out:
         raise typer.Exit(1)
+
+
+def _print_model_difference(folder: Path | None, object_id: int, finder: "Active6D") -> None:
+    from active6d_sim.datasets.bop_models import differs_from_data_set
+
+    if folder is not None and (text := differs_from_data_set(folder, object_id, finder.model)):
+        messages.print(text, highlight=False, markup=False)
 
 
 def _draw_each(
