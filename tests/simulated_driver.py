@@ -39,6 +39,7 @@ class Traits:
     info: CameraInfo | None = None
     info_once: bool = False
     rate_hz: float = 15.0
+    unstamped: tuple[str, ...] = ()
     depth_info: CameraInfo | None = None
     parameters: dict = field(default_factory=dict)
 
@@ -79,9 +80,11 @@ class SimulatedDriver:
         if traits.covariance:
             T = PoseWithCovarianceStamped(header=T.header)
             T.pose.pose = transform_to_pose(view.T_world_camera)
-        self.color.publish(self._color())
-        self.depth.publish(self._depth())
-        self.pose.publish(T)
+        messages = {"color": self._color(), "depth": self._depth(), "pose": T}
+        for name, message in messages.items():
+            if name in traits.unstamped:
+                message.header.stamp.sec = message.header.stamp.nanosec = 0
+            getattr(self, name).publish(message)
 
     def run_until(self, predicate, frames: int = 200) -> None:
         """Publish frames until the predicate holds."""

@@ -217,7 +217,9 @@ PROBLEMS = {
         Traits(depth_frame="camera_depth"),
         "colour is in frame 'camera_color_optical_frame', depth in",
     ),
-    "world": (Traits(pose_frame="base_link"), "frame_id is 'base_link', expected 'world'"),
+    "world": (Traits(pose_frame="base_link"), "in the frame 'base_link', not in 'world': set world_frame"),
+    "no stamps": (Traits(unstamped=("color",)), "stamps on driver/color are 0"),
+    "no stamps of poses": (Traits(unstamped=("pose",)), "stamps on driver/pose are 0"),
     "clocks": (Traits(pose_lag=40 * SECOND), "do both use the same clock"),
     "no info": (Traits(parameters={"info_topic": "driver/other"}), "no camera_info comes on driver/other"),
     "type": (
@@ -241,6 +243,30 @@ def test_what_is_wrong_is_said_in_words_and_no_view_is_published(graph, traits, 
     cell.driver.run(5)
     warnings = [d.status[0] for d in cell.diagnostics if words in d.status[0].message]
     assert all(status.name == "/camera_adapter" for status in warnings)
+
+
+def test_a_warning_whose_numbers_differ_from_image_to_image_is_given_once(graph):
+    cell = Cell(graph, Traits(parameters={"depth_scale": 1000.0}))
+    for share in np.linspace(1.0, 1.1, 20):
+        view = plane_view(CAMERA, POSES[0])
+        cell.driver.view = View(0, view.color, (share * view.depth).astype(np.float32), CAMERA, POSES[0])
+        cell.driver.run(1)
+    cell.driver.run_until(lambda: cell.said("looks like millimetres"))
+    cell.driver.run(8)
+    assert len(cell.said("looks like millimetres")) == 1
+
+
+def test_depth_of_another_size_in_the_same_frame_is_registered(graph):
+    depth_camera = PinholeCamera(320, 240, 300.0, 300.0, 159.5, 119.5)
+    color, depth = plane_view(CAMERA, POSES[0]), plane_view(depth_camera, POSES[0]).depth
+    identity = {"depth_info_topic": "driver/depth_info", "depth_to_color": [0.0] * 6 + [1.0]}
+    traits = Traits(depth_info=camera_to_info(depth_camera, SECOND, FRAME), parameters=identity)
+    apart = SimpleNamespace(color=color.color, depth=depth, camera=CAMERA, T_world_camera=POSES[0])
+    cell = Cell(graph, traits, view=apart)
+    cell.first_view()
+    found = image_to_depth(cell.depth[0])
+    assert np.isfinite(found).mean() > 0.95
+    assert np.nanmax(np.abs(found - color.depth)) < 0.02
 
 
 def test_a_new_episode_begins_on_request(graph):

@@ -22,7 +22,6 @@ from active6d_core.ros.conversions import (
     depth_to_image,
     pose_stamped_to_transform,
     pose_to_transform,
-    require_frame,
     stamp_to_ns,
     transform_to_pose_stamped,
 )
@@ -127,8 +126,13 @@ class CameraAdapterNode(GraphNode):
     def _accept(self, name: str, message: Any) -> None:
         if name in ("info", "depth_info"):
             self._infos[name] = message
+        elif stamp_to_ns(message.header.stamp) == 0:
+            self.say_once(f"stamps on {self._driver.topics[name]} are 0: the driver must set header.stamp")
         elif name == "pose":
-            require_frame(message.header, self.world_frame)
+            if message.header.frame_id != self.world_frame:
+                own = f"poses on {self._driver.topics[name]} are in the frame '{message.header.frame_id}'"
+                self.say_once(f"{own}, not in '{self.world_frame}': set world_frame if its origin is the bin's centre")
+                return
             pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
             self._add_pose(stamp_to_ns(message.header.stamp), pose_to_transform(pose) @ self._T_pose_camera)
         else:
@@ -191,7 +195,7 @@ class CameraAdapterNode(GraphNode):
             # The next image may be better; until then, what is wrong is on record.
             self._gate.waiting = True
             self.say_once(str(error))
-            raise MessageError(str(error)) from error
+            return
         for text in self._maker.warnings:
             self.say_once(text)
         with self.measure(stamp):

@@ -1,5 +1,6 @@
 """What every node publishes about itself: results of its work, refused and lost input, and what it waits for."""
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ from active6d_core.ros.heartbeat import Awaited, Watch
 from active6d_core.ros.parameters import ParameterNode
 
 _LOG_PERIOD_SECONDS = 5.0
+#: A number that stands alone; those within names of topics and frames tell them apart.
+_NUMBER = re.compile(r"(?<=[ (])[\d.]+")
 
 
 class DiagnosticNode(ParameterNode):
@@ -66,9 +69,13 @@ class DiagnosticNode(ParameterNode):
         self._diagnose(DiagnosticStatus.WARN, text, 0, {})
 
     def say_once(self, text: str) -> bool:
-        """Log and publish a warning the first time that it is given; whether there is one (it is not empty)."""
-        if text and text not in self._said:
-            self._said.add(text)
+        """Log and publish a warning the first time that it is given; whether there is one (it is not empty).
+
+        The same words with other numbers are the same warning: a measured number differs from image to image.
+        """
+        words = _NUMBER.sub("#", text)
+        if text and words not in self._said:
+            self._said.add(words)
             self.get_logger().warning(text)
             self._diagnose(DiagnosticStatus.WARN, text, 0, {})
         return bool(text)
