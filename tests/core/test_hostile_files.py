@@ -148,6 +148,18 @@ def test_yaml_of_plain_values_is_read():
     assert structured_text.parse_yaml(text) == yaml.safe_load(text)
 
 
+@pytest.mark.parametrize("text", ["1e-4", "-2E5", ".5e-3", "1.e+3", "1.0e-4", "12e03"])
+def test_numbers_in_scientific_notation_are_numbers(text):
+    """PyYAML alone reads 1e-4 as a text."""
+    assert structured_text.parse_yaml(text) == float(text)
+    assert structured_text.parse_yaml(f"a: [{text}]") == {"a": [float(text)]}
+
+
+@pytest.mark.parametrize("text", ["1e", "e4", "1e-4m", "v1e4", "1_0e3"])
+def test_texts_that_only_look_like_them_are_texts(text):
+    assert structured_text.parse_yaml(text) == text
+
+
 @pytest.mark.parametrize("content", [b"[" * 100_000, b"\xff\xfe", b"{"])
 def test_json_that_recurses_or_is_no_text_is_refused(tmp_path, content):
     (tmp_path / "a.json").write_bytes(content)

@@ -65,6 +65,9 @@ def test_what_is_trained_is_exported_and_evaluated(banks, tmp_path, name, length
         (["--set", "reward.alpha=1"], "--set reward: known are training, weighing"),
         (["--policy", "attention", "--set", "reward.alpha=3"], "alpha and beta must be in [0, 1]"),
         (["--set", "weighing.lookahead=2"], "lookahead is 2"),
+        (["--set", "training.learning_rate=fast"], "--set training.learning_rate: 'fast' is no float"),
+        (["--set", "training.rounds=1.5"], "--set training.rounds: 1.5 is no int"),
+        (["--set", "training.rounds=true"], "--set training.rounds: True is no int"),
     ],
 )
 def test_bad_input_is_one_clear_line(banks, arguments, words):

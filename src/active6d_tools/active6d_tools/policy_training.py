@@ -113,6 +113,12 @@ def _make(kind: type, group: str, own: dict[str, Any], groups: dict[str, dict[st
     unknown = sorted(given.keys() - set(known))
     if unknown:
         raise ValueError(f"--set {group}.{unknown[0]}: known are {', '.join(known)}")
+    for item in fields(kind):
+        value, wanted = given.get(item.name, item.default), type(item.default)
+        if not isinstance(value, (int, float) if wanted is float else wanted) or isinstance(value, bool) > (
+            wanted is bool
+        ):
+            raise ValueError(f"--set {group}.{item.name}: {value!r} is no {wanted.__name__}")
     try:
         return kind(**{**own, **given})
     except TypeError as error:
