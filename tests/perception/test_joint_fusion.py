@@ -13,6 +13,7 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.ambiguity import ambiguity_of
+from active6d_perception.scene import body_candidates, body_refinement, joint_fusion
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer
 from active6d_perception.scene.expected_visibility import OPEN_TABLE
 from active6d_perception.scene.joint_fusion import JointFusion
@@ -161,6 +162,40 @@ def test_another_view_computes_its_own_part_only(mug, episode, monkeypatch):
     of_newest = sum(poses for poses, view in counted if view is newest)
     # Poses that the new view moves are looked at again in the others.
     assert of_newest >= sum(poses for poses, _ in counted) / 4 > 0
+
+
+def test_scattered_hypotheses_cost_no_more_than_their_number(mug, episode, monkeypatch):
+    """Poses that are compared with depth images for one more view: twice as many after twice as many views."""
+    compared = 0
+
+    def counting(function):
+        def count(T, *arguments):
+            nonlocal compared
+            compared += len(T)
+            return function(T, *arguments)
+
+        return count
+
+    monkeypatch.setattr(body_candidates, "_MOST_CLUSTERS", 30)
+    for module, name in ((joint_fusion, "count_cases"), (body_refinement, "normal_equations")):
+        monkeypatch.setattr(module, name, counting(getattr(module, name)))
+    fusion, rng, of_view = fuse(mug, []), np.random.default_rng(0), {}
+    for number in range(1, 17):
+        _, T_world_camera, hypotheses, _, depth, camera = episode[number % len(episode)]
+        T = make_transform(Rotation.random(10, rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, (10, 3)) + [0, 0, 0.25])
+        scattered = Hypotheses(
+            invert(T_world_camera) @ T,
+            rng.uniform(0.1, 0.9, 10),
+            np.tile([0.4, 0.4, 0.6, 0.6], (10, 1)),
+            np.full(10, 0.8),
+            np.ones(10, np.uint16),
+            hypotheses.segmentation,
+        )
+        fusion.add_view(number, T_world_camera, scattered, rng.uniform(-0.5, 0.9, 10), depth, camera)
+        compared = 0
+        fusion.objects(number, T_world_camera, camera)
+        of_view[number] = compared
+    assert of_view[16] < 2.2 * of_view[8]
 
 
 def test_the_current_view_gives_boxes_where_it_has_hypotheses(mug, episode):

@@ -17,7 +17,7 @@ from active6d_perception.model.visible_samples import direction_of, nearest_dire
 from active6d_perception.scene.body_candidates import BodyCandidates, gather_candidates, merge_duplicates, number_places
 from active6d_perception.scene.body_refinement import BodyRefinement, normal_equations
 from active6d_perception.scene.measured_view import NORMAL, measure_view
-from active6d_perception.scene.memo import Memo
+from active6d_perception.scene.memo import Memo, ViewSums
 from active6d_perception.scene.pose_lattice import round_poses
 
 SPHERE = ViewSphere()
@@ -102,6 +102,33 @@ def test_images_of_different_sizes_are_refused(mug):
         measure_view(np.zeros((240, 320), np.float32), CAMERA, np.eye(4), Hypotheses.empty(4, 6), ambiguity_of(mug))
 
 
+def test_sums_over_views_ask_a_new_view_for_every_key_and_the_others_for_new_keys():
+    asked, sums = [], ViewSums()
+
+    def power(missing, view):
+        asked.append((view, sorted(keys[index] for index in missing)))
+        return np.array([[float(keys[index]) ** view] for index in missing])
+
+    def total(views, known):
+        nonlocal keys
+        keys = known
+        sums.follow(views)
+        asked.clear()
+        return sums.sums(keys, power, np.zeros(1))[:, 0].tolist()
+
+    keys, one, two, three = [], 1, 2, 3  # powers stand for views
+    assert total([one, two], [3, 5, 3]) == [12, 30, 12]
+    assert asked == [(1, [3, 5]), (2, [3, 5])]
+    sums.sweep()
+    assert total([one, two, three], [3, 2]) == [39, 14]
+    assert asked == [(1, [2]), (2, [2]), (3, [2, 3])]
+    sums.sweep()
+    sums.sweep()
+    assert total([one, two, three], [3]) == [39]
+    assert asked == [(1, [3]), (2, [3]), (3, [3])]
+    assert total([two, three], [3]) == [36], "a view that is gone does not count"
+
+
 def test_a_memo_computes_each_row_once_until_it_is_not_asked_for():
     asked = []
 
@@ -174,15 +201,22 @@ def test_equations_are_those_of_brute_force(mug, views_of_mug, search):
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+def over(views):
+    sums = ViewSums()
+    sums.follow(views)
+    return sums
+
+
 def test_refinement_finds_the_pose_and_more_views_find_it_better(mug, views_of_mug):
     refinement = BodyRefinement(ambiguity_of(mug).all_samples, 5 * (0.008,) + 5 * (0.004,), 0.001)
     rng, starts = np.random.default_rng(1), []
     for _ in range(8):
         turn = Rotation.from_rotvec(rng.normal(0, 0.04, 3)).as_matrix()
         starts.append(POSE @ make_transform(turn, rng.normal(0, 0.002, 3)))
-    remembered = [(view, Memo()) for view in views_of_mug]
-    both = [pose_error(T, POSE)[0] for T in refinement.refine(np.array(starts), remembered)]
-    one = [pose_error(T, POSE)[0] for T in refinement.refine(np.array(starts), remembered[:1])]
+    both, one = (
+        [pose_error(T, POSE)[0] for T in refinement.refine(np.array(starts), over(views))]
+        for views in (views_of_mug, views_of_mug[:1])
+    )
     assert np.median(both) < 0.4e-3
     assert np.median(both) < np.median(one)
 
@@ -190,15 +224,16 @@ def test_refinement_finds_the_pose_and_more_views_find_it_better(mug, views_of_m
 def test_what_is_remembered_changes_nothing(mug, views_of_mug):
     refinement = BodyRefinement(ambiguity_of(mug).body_samples, (0.008, 0.004), 0.002)
     T = POSE @ make_transform(np.eye(3), [0.002, 0.001, 0.0])
-    fresh = refinement.refine(T[None], [(view, Memo()) for view in views_of_mug])
-    used = [(view, Memo()) for view in views_of_mug]
-    refinement.refine(T[None], used[:1])
+    fresh = refinement.refine(T[None], over(views_of_mug))
+    used = over(views_of_mug[:1])
+    refinement.refine(T[None], used)
+    used.follow(views_of_mug)
     np.testing.assert_array_equal(refinement.refine(T[None], used), fresh)
 
 
 def test_a_pose_without_measurements_stays(mug, views_of_mug):
     far = make_transform(np.eye(3), [0.0, 0.0, 0.6])[None]
-    refined = BodyRefinement(ambiguity_of(mug).body_samples, (0.008,), 0.001).refine(far, [(views_of_mug[0], Memo())])
+    refined = BodyRefinement(ambiguity_of(mug).body_samples, (0.008,), 0.001).refine(far, over(views_of_mug[:1]))
     np.testing.assert_array_equal(refined, far)
 
 

@@ -1,8 +1,8 @@
 """Refines poses jointly over the depth images of several views, by visible-surface ICP in the world.
 
 Each step takes the equations of every view at the pose rounded to a lattice (:mod:`.pose_lattice`). So the equations of
-a view depend on the rounded pose alone and are cached: a new view adds only its own equations, and the result does not
-depend on the order of views.
+a view depend on the rounded pose alone, and their sum is cached: a new view adds only its own equations, and the result
+does not depend on the order of views.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from active6d_core.se3 import make_transform
 from active6d_perception.compiled import compiled
 from active6d_perception.model.visible_samples import VisibleSamples, direction_of
 from active6d_perception.scene.measured_view import NORMAL, MeasuredView
-from active6d_perception.scene.memo import Memo
+from active6d_perception.scene.memo import ViewSums
 from active6d_perception.scene.pose_lattice import round_poses
 
 _ALIKE = 0.5  # cosine between normals of a pair
@@ -46,8 +46,8 @@ class BodyRefinement:
     ) -> None:
         self._samples, self._gates, self._lattice, self._search = samples, gates, lattice, search
 
-    def refine(self, T_world_object: np.ndarray, views: Sequence[tuple[MeasuredView, Memo]]) -> np.ndarray:
-        """Refine (k, 4, 4) poses, metres, over views with what is remembered of each.
+    def refine(self, T_world_object: np.ndarray, sums: ViewSums) -> np.ndarray:
+        """Refine (k, 4, 4) poses, metres, over the views of ``sums``.
 
         Returns:
             (k, 4, 4) poses; one with fewer than 6 pairs stays as it was.
@@ -55,19 +55,14 @@ class BodyRefinement:
         T = np.array(T_world_object, float)
         for gate in self._gates:
             rounded, keys = round_poses(T, T_world_object, self._lattice)
-            total = np.zeros((len(T), _COLUMNS))
-            for view, memo in views:
-                total += self._equations(rounded, keys, view, memo, gate)
-            T = _step(T, rounded, total)
+            T = _step(T, rounded, self._equations(rounded, keys, sums, gate))
         return T
 
-    def _equations(
-        self, rounded: np.ndarray, keys: list[bytes], view: MeasuredView, memo: Memo, gate: float
-    ) -> np.ndarray:
-        def compute(missing: np.ndarray) -> np.ndarray:
+    def _equations(self, rounded: np.ndarray, keys: list[bytes], sums: ViewSums, gate: float) -> np.ndarray:
+        def compute(missing: np.ndarray, view: MeasuredView) -> np.ndarray:
             return normal_equations(rounded[missing], self._samples, view, gate, self._search)
 
-        return memo.rows([(gate, id(self._samples), key) for key in keys], compute)
+        return sums.sums([(gate, id(self._samples), key) for key in keys], compute, np.zeros(_COLUMNS))
 
 
 def refine_poses(

@@ -5,8 +5,8 @@ evidence is what every depth image measured where a candidate has its surface: t
 or something behind it. Poses in which solid objects overlap are improbable.
 
 The result depends on the set of views. It does not depend on their order, unless poses of cameras are corrected
-(:mod:`.camera_alignment`). The comparison of a pose with a view is computed once and cached (:mod:`.memo`), so the cost
-of a new view does not grow with the number of views before it.
+(:mod:`.camera_alignment`). The comparison of a pose with all views is a sum that is cached (:mod:`.memo`): a new view
+is compared with all poses, and the views before it with poses that are new.
 """
 
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ from active6d_perception.scene.fusion import FusionParameters, preference, proje
 from active6d_perception.scene.hypothesis_table import HypothesisTable, confidence
 from active6d_perception.scene.measured_cases import CASES, count_cases
 from active6d_perception.scene.measured_view import MeasuredView, measure_view
-from active6d_perception.scene.memo import Memo
+from active6d_perception.scene.memo import Memo, ViewSums
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS, describe_objects
 from active6d_perception.scene.pose_lattice import round_poses
 from active6d_perception.scene.rotation_belief import PlaceBeliefs, decide, posterior
@@ -50,12 +50,6 @@ WHOLE_GATES, _WHOLE_LATTICE = (0.008, 0.004), 0.0005
 HOPELESS = 12.0
 # Evidence is taken at poses on this lattice, metres.
 _LATTICE = 0.001
-
-
-@dataclass(frozen=True, eq=False)
-class _SeenView:
-    measured: MeasuredView
-    memo: Memo
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,14 +127,14 @@ class JointFusion:
     @property
     def views(self) -> dict[int, MeasuredView]:
         """What is kept of each view, by its stamp."""
-        return {stamp: view.measured for stamp, view in self._views.items()}
+        return dict(self._views)
 
     def reset(self) -> None:
         """Forget all views."""
         self._known.reset()
-        self._views: dict[int, _SeenView] = {}
+        self._views: dict[int, MeasuredView] = {}
         self.cameras.reset()
-        self._feasible = Memo()
+        self._sums, self._feasible = ViewSums(), Memo()
 
     def forget_before(self, stamp: int) -> None:
         """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
@@ -179,7 +173,7 @@ class JointFusion:
         if self._align:
             measured = self.cameras.add_view(stamp, measured)
         self._known.add_view(stamp, invert(measured.T_camera_world), hypotheses, verification)
-        self._views[stamp] = _SeenView(measured, Memo())
+        self._views[stamp] = measured
         return True
 
     def evidence(self) -> SceneEvidence:
@@ -206,8 +200,8 @@ class JointFusion:
             self._among_neighbours(candidates, heads, telling),
             ambiguity.diameter,
         )
-        for memo in (self._feasible, *(view.memo for view in self._views.values())):
-            memo.sweep()
+        self._feasible.sweep()
+        self._sums.sweep()
         return evidence
 
     def _possible(self, bodies: BodyEvidence) -> np.ndarray:
@@ -221,8 +215,9 @@ class JointFusion:
         known = self._known
         return preference(known.table[:, 0], known.table[:, 1], known.T_world_object, self.parameters)
 
-    def _sorted_views(self) -> list[_SeenView]:
-        return [self._views[stamp] for stamp in sorted(self._views)]
+    def _all_views(self) -> ViewSums:
+        self._sums.follow([self._views[stamp] for stamp in sorted(self._views)])
+        return self._sums
 
     def candidates(self) -> BodyCandidates:
         """The refined bodies that the hypotheses of all views propose, with their twins."""
@@ -232,28 +227,22 @@ class JointFusion:
         table = known.table[order]
         squared = confidence(table[:, 0], table[:, 1]) ** 2
         found = gather_candidates(labels, known.T_world_object[order], squared, ambiguity)
-        views = [(view.measured, view.memo) for view in self._sorted_views()]
-        return merge_duplicates(
-            replace(found, T_world_object=self._bodies.refine(found.T_world_object, views)), ambiguity
-        )
+        refined = self._bodies.refine(found.T_world_object, self._all_views())
+        return merge_duplicates(replace(found, T_world_object=refined), ambiguity)
 
     def _count(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:
         """(K, r, CASES) counts of a part over all views."""
         ambiguity = self.ambiguity
         rounded, keys = _rounded(candidates)
-        total = np.zeros((len(keys), len(part.rotations), CASES), np.int64)
+        none = np.zeros((len(part.rotations), CASES), np.int64)
         if not part.samples.number.any():
-            return total
-        for view in self._views.values():
+            return np.tile(none, (len(keys), 1, 1))
 
-            def compute(missing: np.ndarray, view: _SeenView = view) -> np.ndarray:
-                place = OWN_PLACE * ambiguity.diameter
-                return count_cases(
-                    rounded[missing], part.rotations, ambiguity.middle, place, part.samples, view.measured
-                )
+        def compute(missing: np.ndarray, view: MeasuredView) -> np.ndarray:
+            place = OWN_PLACE * ambiguity.diameter
+            return count_cases(rounded[missing], part.rotations, ambiguity.middle, place, part.samples, view)
 
-            total += view.memo.rows([(part.name, key) for key in keys], compute)
-        return total
+        return self._all_views().sums([(part.name, key) for key in keys], compute, none)
 
     def _in_container(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:
         """(K, r, 5), see :func:`.against_container`."""
@@ -294,7 +283,7 @@ class JointFusion:
         """(n, 4, 4) ``T_world_object`` of the beliefs, refined as whole objects, metres."""
         rotation = self.ambiguity.mean_rotation(beliefs.weight)
         T = evidence.candidates.T_world_object[beliefs.candidate] @ rotation
-        return self._whole.refine(T, [(view.measured, view.memo) for view in self._sorted_views()])
+        return self._whole.refine(T, self._all_views())
 
     def describe(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> JointObjects:
         """The objects of all views so far with what is known of them; arguments as for :meth:`objects`."""

@@ -1,8 +1,10 @@
-"""A cache of table rows by key, so that a result for a pose is computed once."""
+"""Caches of table rows by key, so that a result for a pose is computed once."""
 
 from collections.abc import Callable, Hashable, Sequence
 
 import numpy as np
+
+from active6d_perception.scene.measured_view import MeasuredView
 
 
 class Memo:
@@ -42,4 +44,54 @@ class Memo:
 
     def sweep(self) -> None:
         """Forget the rows that have not been asked for since the last sweep."""
+        self._old, self._new = self._new, {}
+
+
+class ViewSums:
+    """Sums of rows over views, by key. A view that comes after the known ones costs one row for each known key.
+
+    Views are summed in their order, so that a sum does not depend on when it was begun. Sums that are not used between
+    two calls of :meth:`sweep` are removed.
+    """
+
+    def __init__(self) -> None:
+        self._views: list[MeasuredView] = []
+        self._old: dict[Hashable, tuple[int, np.ndarray]] = {}
+        self._new: dict[Hashable, tuple[int, np.ndarray]] = {}
+
+    def follow(self, views: Sequence[MeasuredView]) -> None:
+        """Sum over these views from now on; sums are kept if the known views are the first of them."""
+        if len(self._views) > len(views) or any(a is not b for a, b in zip(self._views, views, strict=False)):
+            self._old, self._new = {}, {}
+        self._views = list(views)
+
+    def sums(
+        self, keys: Sequence[Hashable], compute: Callable[[np.ndarray, MeasuredView], np.ndarray], zero: np.ndarray
+    ) -> np.ndarray:
+        """Return the sums of all keys.
+
+        Args:
+            keys: of k rows.
+            compute: (m,) indices of keys and a view to their (m, ...) rows there.
+            zero: (...) sum over no view; its shape and type are those of the sums.
+
+        Returns:
+            (k, ...) sums.
+        """
+        number: dict[Hashable, int] = {}
+        of_key = np.array([number.setdefault(key, len(number)) for key in keys], np.intp)
+        known = [self._new.get(key) or self._old.get(key) or (0, zero) for key in number]
+        total = np.array([total for _, total in known], zero.dtype).reshape(-1, *zero.shape)
+        covered = np.array([count for count, _ in known], np.intp)
+        index = np.full(len(number), -1)
+        index[of_key[::-1]] = np.arange(len(keys))[::-1]
+        for place in range(int(covered.min(initial=len(self._views))), len(self._views)):
+            rows = np.flatnonzero(covered <= place)
+            total[rows] += compute(index[rows], self._views[place])
+        for key, row in number.items():
+            self._new[key] = len(self._views), total[row]
+        return total[of_key]
+
+    def sweep(self) -> None:
+        """Forget the sums that have not been asked for since the last sweep."""
         self._old, self._new = self._new, {}
