@@ -14,6 +14,7 @@ from active6d_agent.evaluation.policy_evaluation import all_starts, measure, run
 from active6d_perception.scene.fusion import RANKINGS, FusionParameters
 from active6d_tools import bank_building
 from active6d_tools.cli import app
+from active6d_tools.cli.options import LEARNED
 
 
 def run(*arguments: str):
@@ -139,7 +140,8 @@ def untrained(tmp_path_factory):
             else:
                 network = view_attention.ViewAttention()
                 view_attention.save_network(network, own / "best.safetensors", "mug")
-            (own / "curve.jsonl").write_text(json.dumps({"seconds": 90.0}) + "\n")
+            done = {"round": 30} if name == "view-attention" else {"steps": 1_000_000}
+            (own / "curve.jsonl").write_text(json.dumps({**done, "seconds": 90.0}) + "\n")
     return folder
 
 
@@ -267,10 +269,12 @@ def test_missing_seeds_are_trained(banks, tmp_path, monkeypatch):
     )
     folder = tmp_path / "mug"
     there = folder / "attention" / "seed1" / policy_training.BEST
-    there.parent.mkdir(parents=True)
-    there.touch()
+    for seed, steps in ((1, 1_000_000), (2, 950_000)):
+        own = folder / "attention" / f"seed{seed}"
+        own.mkdir(parents=True)
+        (own / "curve.jsonl").write_text(json.dumps({"steps": 50_000}) + "\n" + json.dumps({"steps": steps}) + "\n")
     validation = BatchedFusion(load_bank(bank_path(banks, "mug", "val")))
-    found = ablate._train_seeds(validation, folder, 5, banks)
+    found = ablate._train_seeds(LEARNED, validation, folder, 5, banks)
     assert found["attention", 1] == there
     every = [folder / name / f"seed{seed}" for name in ("view-attention", "attention") for seed in range(3)]
     assert [path for path, _, _ in asked] == [path for path in every if path != there.parent]
@@ -278,6 +282,30 @@ def test_missing_seeds_are_trained(banks, tmp_path, monkeypatch):
     train, same = asked[0][1]
     assert len(train.bank.scenes) == 2
     assert same is validation
+
+
+def test_the_papers_policy_is_trained_in_full_and_begun_trainings_go_on(banks, tmp_path, monkeypatch):
+    """Ten million steps at 1e-4, three seeds; the one that was interrupted is resumed."""
+    from active6d_agent.policies.attention import ppo
+    from active6d_tools.cli import ablate
+
+    asked = []
+
+    def train(train, val, folder, parameters, reward, *, resume):
+        asked.append((folder.name, parameters, resume))
+        yield from ()
+
+    monkeypatch.setattr(ppo, "train_ppo", train)
+    begun = tmp_path / "mug" / "attention-paper" / "seed1"
+    begun.mkdir(parents=True)
+    (begun / "latest.json").write_text("{}")
+    validation = BatchedFusion(load_bank(bank_path(banks, "mug", "val")))
+    found = ablate._train_seeds(("attention-paper",), validation, tmp_path / "mug", 5, banks)
+    assert [(name, resume) for name, _, resume in asked] == [("seed0", False), ("seed1", True), ("seed2", False)]
+    for _, parameters, _ in asked:
+        assert (parameters.total, parameters.learning_rate) == (10_000_000, 1e-4)
+        assert (parameters.batch, parameters.gamma) == (128, 0.995)
+    assert found["attention-paper", 1] == begun / "best.safetensors"
 
 
 @pytest.mark.parametrize(

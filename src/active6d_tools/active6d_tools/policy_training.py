@@ -31,6 +31,13 @@ class PolicyTraining:
         """The weights with the best validation result."""
         return self.folder / BEST
 
+    def is_complete(self) -> bool:
+        """Whether it has been trained to its end."""
+        if not (self.folder / "curve.jsonl").is_file():
+            return False
+        last = self.curve()[-1:]
+        return any(row.get("round", row.get("steps", 0)) >= self.total for row in last)
+
     def curve(self) -> list[dict[str, Any]]:
         """The validation results so far."""
         return [json.loads(line) for line in (self.folder / "curve.jsonl").read_text().splitlines()]
@@ -46,7 +53,7 @@ def plan_training(
     groups: dict[str, dict[str, Any]] | None = None,
     resume: bool = False,
 ) -> PolicyTraining:
-    """A training of "view-attention" (DAgger) or "attention" (PPO); nothing starts yet.
+    """A training of "view-attention" (DAgger), or of "attention" or "attention-paper" (PPO); nothing starts yet.
 
     Args:
         policy: to train.
@@ -60,8 +67,14 @@ def plan_training(
     Raises:
         ValueError: an unknown group or parameter, or a value out of range.
     """
-    plan = _plan_dagger if policy == "view-attention" else _plan_ppo
-    return plan(folder, {"steps": steps, "seed": seed}, length, groups or {}, resume)
+    common: dict[str, Any] = {"steps": steps, "seed": seed}
+    if policy == "view-attention":
+        return _plan_dagger(folder, common, length, groups or {}, resume)
+    if policy == "attention-paper":
+        from active6d_agent.policies.attention.ppo import AS_IN_THE_PAPER
+
+        common |= AS_IN_THE_PAPER
+    return _plan_ppo(folder, common, length, groups or {}, resume)
 
 
 def _plan_dagger(

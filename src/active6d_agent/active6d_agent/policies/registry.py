@@ -140,7 +140,7 @@ _registry: Registry[Policy] = Registry(
     choose_policy,
     {
         **dict.fromkeys(_BASELINES, "active6d_agent.policies.baselines"),
-        "attention": "active6d_agent.policies.attention.network",
+        **dict.fromkeys(("attention", "attention-paper"), "active6d_agent.policies.attention.network"),
         "information-gain": "active6d_agent.policies.view_attention.information_gain",
         "view-attention": "active6d_agent.policies.view_attention.network",
         "sb3": "active6d_agent.policies.sb3",

@@ -1,6 +1,6 @@
 """``active6d ablate PART``: the paper's ablations, and ablations of the default policy."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +9,7 @@ import typer
 
 from active6d_tools.cli.options import (
     LEARNED,
+    PAPER,
     Banks,
     Imports,
     JsonFile,
@@ -41,12 +42,13 @@ class Part(StrEnum):
     PLANNING = "planning"
     NOISE_RESAMPLING = "noise-resampling"
     SEEDS = "seeds"
+    PAPER = "paper"
 
 
 _TRAINED = (Part.ALPHA, Part.ATTENTION, Part.SIGNS)
 #: Seed of the noise in the second bank of ``noise-resampling``.
 _AGAIN = 1
-#: Trainings of each learned policy that ``seeds`` compares.
+#: Trainings of each learned policy that ``seeds`` and ``paper`` compare.
 _SEEDS = 3
 _OUT = "Folder of the trainings; by default in the cache folder."
 _POLICIES = "Policies that choose the views: {policies}; verification and fusion use only the first one."
@@ -77,7 +79,7 @@ def ablate(
     [bold]signs[/bold]: signs of the reward, inverted and as the paper prints them. [bold]planning[/bold]: parameters
     of the default policy, without training. [bold]noise-resampling[/bold]: the same views with other sensor noise,
     from a second bank (active6d bank --split test --seed 1). [bold]seeds[/bold]: three trainings of both learned
-    policies; missing ones are trained.
+    policies. [bold]paper[/bold]: three in the paper's length, for hours. Missing trainings start, begun ones go on.
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """
@@ -85,7 +87,6 @@ def ablate(
     from active6d_agent.bank.joint_lookup import make_lookup
     from active6d_agent.bank.scene_bank import load_bank
     from active6d_agent.evaluation.policy_evaluation import all_starts
-    from active6d_agent.evaluation.training_seeds import compare_seeds, mark_best
     from active6d_tools.report.ablation_plots import ablation_panels
     from active6d_tools.report.line_plots import draw_panels
 
@@ -99,11 +100,10 @@ def ablate(
     names = [name.strip() for name in policies.split(",")]
     if part in _TRAINED:
         rows = _train_variants(part, lookups, _folder(out, "ablations", object_name), steps, length, starts, seed)
-    elif part is Part.SEEDS:
-        weights = _train_seeds(lookups["val"], _folder(out, "policies", object_name), steps, banks)
-        made = compare_seeds(lookups["val"], lookups["test"], weights, starts, steps, sample=sample, seed=seed)
-        rows = collect_rows(made, len(weights), "evaluating")
-        mark_best(rows)
+    elif part in (Part.SEEDS, Part.PAPER):
+        trained = LEARNED if part is Part.SEEDS else (PAPER,)
+        weights = _train_seeds(trained, lookups["val"], _folder(out, "policies", object_name), steps, banks)
+        rows = _compare_seeds(lookups, weights, starts, steps, sample, seed)
     else:
         rows = _evaluate_variants(part, lookups, names, starts, steps, seed, parameters)
     _print(rows, f"{part.value}, {object_name}, {len(starts)} episodes")
@@ -118,7 +118,10 @@ def _find_banks(part: Part, object_name: str, folder: Path | None) -> dict[str, 
     """The banks of the splits that a part needs, and the test scenes' second one as ``again``."""
     from active6d_agent.bank.scene_bank import find_bank
 
-    splits = {Part.SEEDS: ("val", "test"), **dict.fromkeys(_TRAINED, ("train", "val", "test"))}.get(part, ("test",))
+    splits = {
+        **dict.fromkeys((Part.SEEDS, Part.PAPER), ("val", "test")),
+        **dict.fromkeys(_TRAINED, ("train", "val", "test")),
+    }.get(part, ("test",))
     paths = {split: find_bank(object_name, split, folder) for split in splits}
     return paths | ({"again": find_bank(object_name, "test", folder, _AGAIN)} if part is Part.NOISE_RESAMPLING else {})
 
@@ -181,20 +184,37 @@ def _evaluate_variants(
     return collect_rows(rows, 2 * len({*names, "random", "oracle"}) + 1, "resampling the noise")
 
 
+def _compare_seeds(
+    lookups: dict[str, "SceneLookup"],
+    weights: dict[tuple[str, int], Path],
+    starts: "np.ndarray",
+    steps: int,
+    sample: int | None,
+    seed: int,
+) -> list[dict[str, Any]]:
+    from active6d_agent.evaluation.training_seeds import compare_seeds, mark_best
+
+    made = compare_seeds(lookups["val"], lookups["test"], weights, starts, steps, sample=sample, seed=seed)
+    rows = collect_rows(made, len(weights), "evaluating")
+    mark_best(rows)
+    return rows
+
+
 def _train_seeds(
-    validation: "SceneLookup", folder: Path, steps: int, banks: Path | None
+    policies: Sequence[str], validation: "SceneLookup", folder: Path, steps: int, banks: Path | None
 ) -> dict[tuple[str, int], Path]:
-    """Weights of every learned policy and seed; missing ones are trained as by ``active6d train policy``."""
+    """Weights of every policy and seed; missing ones are trained as by ``active6d train policy``, begun ones go on."""
     from active6d_agent.bank.joint_lookup import make_lookup
     from active6d_agent.bank.scene_bank import find_bank, load_bank
     from active6d_tools.policy_training import plan_training
 
-    trainings = {
-        (name, seed): plan_training(name, folder / name / f"seed{seed}", steps=steps, seed=seed)
-        for name in LEARNED
-        for seed in range(_SEEDS)
-    }
-    missing = {key: training for key, training in trainings.items() if not training.best.is_file()}
+    trainings = {}
+    for name in policies:
+        for seed in range(_SEEDS):
+            own = folder / name / f"seed{seed}"
+            begun = (own / "latest.json").is_file()
+            trainings[name, seed] = plan_training(name, own, steps=steps, seed=seed, resume=begun)
+    missing = {key: training for key, training in trainings.items() if not training.is_complete()}
     if missing:
         train = make_lookup(load_bank(find_bank(validation.model.name, "train", banks)))
         for (name, seed), training in missing.items():

@@ -82,6 +82,8 @@ ALL_POLICIES = (
 
 #: Policies that ``active6d train policy`` trains.
 LEARNED = ("view-attention", "attention")
+#: The paper's policy, trained with the paper's length and learning rate.
+PAPER = "attention-paper"
 
 
 def parse_overrides(texts: list[str]) -> dict[str, dict[str, Any]]:

@@ -132,8 +132,10 @@ class AttentionPolicy(DeterministicPolicy):
         ValueError: there are no usable weights.
     """
 
+    name = "attention"
+
     def __init__(self, model: ObjectModel, weights: str = "") -> None:
-        self.network = load_network(Path(weights) if weights else weights_path("attention", model.name))
+        self.network = load_network(Path(weights) if weights else weights_path(self.name, model.name))
 
     def decide(self, observation: Observation) -> Decision:
         """Attend to one object and go to the candidate nearest to the mean."""
@@ -150,6 +152,13 @@ class AttentionPolicy(DeterministicPolicy):
         view = decode(mean.double().clamp(-1.0, 1.0).numpy(), observation.sphere, candidates[None])[0]
         attended = int(index[0]) if count else None
         return Decision.go_to(observation, view, attention / max(attention.sum(), 1e-12), attended)
+
+
+@register_policy("attention-paper")
+class PaperAttentionPolicy(AttentionPolicy):
+    """The same with weights that were trained as the paper says, to the letter: see :data:`.ppo.AS_IN_THE_PAPER`."""
+
+    name = "attention-paper"
 
 
 def encode_observations(observations: Sequence[Observation], steps: int) -> dict[str, torch.Tensor]:

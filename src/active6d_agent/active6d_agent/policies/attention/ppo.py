@@ -34,6 +34,9 @@ from active6d_agent.policies.attention.network import (
 from active6d_agent.policies.registry import Observation
 from active6d_core.files import Checkpoints, atomic_file, write_file
 
+#: The paper's length of the training and its learning rate (supplement E); batch and discount are the usual ones here.
+AS_IN_THE_PAPER = {"total": 10_000_000, "learning_rate": 1e-4}
+
 
 @dataclass(frozen=True)
 class PpoParameters:
