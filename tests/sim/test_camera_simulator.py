@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
 from hand_made_scenes import SPHERE, store_mugs
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import Trigger
 
 from active6d_core.camera import PinholeCamera
@@ -169,6 +169,17 @@ def test_an_arm_refuses_what_it_cannot_reach_and_takes_its_time(watched, mugs):
     true = exact.capture(told @ hand_eye_error(20.0, 0.0, 0), watched.stamps()[1]).depth
     np.testing.assert_array_equal(depth, true)
     assert not np.array_equal(depth, exact.capture(told, watched.stamps()[1]).depth, equal_nan=True)
+
+
+def test_an_arm_publishes_its_joints_with_every_view(watched, mugs):
+    states = watched.graph.mailbox(JointState, "joint_states", latched=True)
+    watched.start(carrier="arm")
+    watched.graph.spin_until(lambda: states)
+    arm = CameraArm(mugs)
+    arm.place(SPHERE.pose(SPHERE.positions[45]))
+    assert states[0].name == [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
+    np.testing.assert_allclose(states[0].position, arm.joints, atol=1e-9)
+    assert stamp_to_ns(states[0].header.stamp) == watched.stamps()[0]
 
 
 def test_poses_are_said_with_errors_when_asked_for(watched, mugs):

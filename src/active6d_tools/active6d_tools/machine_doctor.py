@@ -124,6 +124,8 @@ def _ros() -> Iterator[Check]:
     optional = {"vision_msgs": "Detection3DArray output", "tf2_msgs": "/tf output", "launch_ros": "launch files"}
     for module, purpose in optional.items():
         fix = f"{APT_ROS}{module.replace('_', '-')} ({purpose})"
+        if module == "tf2_msgs":
+            fix = f"make transforms, or {fix}"
         yield _import_check("ROS 2, optional", module, module, needed=False, fix=fix)
     for program, package in (("ros2", "ros-jazzy-ros2cli"), ("colcon", "python3-colcon-common-extensions")):
         path = shutil.which(program) or shutil.which(str(Path(sys.executable).parent / program))

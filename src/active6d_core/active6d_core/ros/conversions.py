@@ -7,7 +7,7 @@ message objects that rosbags deserialises.
 
 import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion, Vector3
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -284,6 +284,16 @@ def image_to_pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
     pixels = np.ascontiguousarray(rows).view(dtype.newbyteorder(">" if message.is_bigendian else "<"))
     pixels = pixels.astype(dtype.newbyteorder("="), copy=False)
     return pixels.reshape(height, width, channels) if channels > 1 else pixels.reshape(height, width)
+
+
+# Arms
+
+
+def joints_to_state(names: Sequence[str], joints: np.ndarray, stamp: int) -> JointState:
+    """(n,) angles in radians of named joints to a JointState of an arm at rest."""
+    state = JointState(header=make_header(stamp, ""), name=list(names), position=np.asarray(joints, float).tolist())
+    state.velocity = [0.0] * len(state.position)
+    return state
 
 
 # Cameras

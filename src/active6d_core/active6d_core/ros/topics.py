@@ -118,6 +118,7 @@ REPLAYED_TOPICS = (*CAMERA_TOPICS, GROUND_TRUTH, EPISODE_START)
 # Outputs beside the contract, which are not recorded. Those of tf2_msgs and vision_msgs exist where these are found.
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock", Per.WHENEVER, "", transient_local=False)
 TRANSFORMS = Topic("/tf", "tf2_msgs/msg/TFMessage", Per.VIEW, "", transient_local=False)
+JOINT_STATES = Topic("joint_states", "sensor_msgs/msg/JointState", Per.VIEW, _CAMERA)
 CAMERA_POSES = Topic("objects/camera_poses", _POSES, Per.VIEW, _FUSION)
 DETECTIONS = Topic("objects/detections", "vision_msgs/msg/Detection3DArray", Per.VIEW, _FUSION)
 

@@ -9,7 +9,9 @@ from std_srvs.srv import Trigger
 from active6d_core.camera import PinholeCamera, View
 from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
+from active6d_core.ros.conversions import joints_to_state
 from active6d_core.ros.runner import run_node
+from active6d_core.ros.topics import JOINT_STATES
 from active6d_core.se3 import quaternion_from_transform
 from active6d_sim.nodes.moving_camera import MovingCameraNode
 from active6d_sim.rendering.pose_error import PoseError
@@ -36,6 +38,7 @@ class CameraSimulatorNode(MovingCameraNode):
         self.declare("height", 480, "image height in pixels", minimum=16, maximum=4096)
         self.declare("field_of_view", 60.0, "horizontal field of view in degrees", minimum=5.0, maximum=150.0)
         self._declare_arm()
+        self._joint_states = self.output(JOINT_STATES)
         self.create_service(Trigger, "~/next_scene", self._on_next_scene)
 
     def _declare_arm(self) -> None:
@@ -121,6 +124,8 @@ class CameraSimulatorNode(MovingCameraNode):
         rng = np.random.default_rng([self.seed, self._simulator.scene.seed, stamp])
         T_said_true = self._T_calibrated_true @ self._pose_error.draw(rng)
         view = self._simulator.capture(T_world_camera @ T_said_true, stamp)
+        if self._arm is not None:
+            self._joint_states.publish(joints_to_state(self._arm.arm.names, self._arm.joints, stamp))
         return replace(view, T_world_camera=T_world_camera)
 
     def _on_next_scene(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

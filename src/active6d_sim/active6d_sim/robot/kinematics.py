@@ -23,10 +23,12 @@ class SerialArm:
     Attributes:
         T_link_joint: (n, 4, 4) frame of each joint at angle 0 in the link before it, metres.
         limits: (n, 2) lowest and highest angle, radians.
+        names: of the n joints.
     """
 
     T_link_joint: np.ndarray
     limits: np.ndarray
+    names: tuple[str, ...] = ()
 
     @classmethod
     def from_urdf(cls, path: Path) -> "SerialArm":
@@ -35,7 +37,7 @@ class SerialArm:
         Raises:
             ValueError: a joint turns about another axis than z, or does not follow the one before.
         """
-        frames, limits, last = [], [], None
+        frames, limits, names, last = [], [], [], None
         for joint in ElementTree.parse(path).getroot().iterfind("joint[@type='revolute']"):
             parts = {part.tag: part.attrib for part in joint}
             if last not in (None, parts["parent"]["link"]) or _floats(parts["axis"]["xyz"]) != [0.0, 0.0, 1.0]:
@@ -45,8 +47,9 @@ class SerialArm:
             rotation = Rotation.from_euler("xyz", _floats(parts["origin"]["rpy"]))
             frames.append(make_transform(rotation.as_matrix(), _floats(parts["origin"]["xyz"])))
             limits.append([float(parts["limit"][end]) for end in ("lower", "upper")])
+            names.append(joint.get("name", ""))
             last = parts["child"]["link"]
-        return cls(np.array(frames), np.array(limits))
+        return cls(np.array(frames), np.array(limits), tuple(names))
 
     def links(self, T_world_base: np.ndarray, joints: np.ndarray) -> np.ndarray:
         """(n, 4, 4) ``T_world_link`` of the link after each joint at (n,) angles in radians; the last is the flange."""
