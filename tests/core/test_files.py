@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from active6d_core.files import Checkpoints, atomic_file, cache_folder, sha256_of, write_file
+from active6d_core.files import Checkpoints, atomic_file, cache_folder, make_folder, sha256_of, write_file
 
 
 def test_the_cache_follows_the_xdg_variable(monkeypatch, tmp_path):
@@ -57,6 +57,8 @@ def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):
     words = r"file/active6d/banks cannot be written \(Not a directory\); set XDG_CACHE_HOME"
     with pytest.raises(OSError, match=words):
         write_file(cache_folder("banks") / "a.npz", "")
+    with pytest.raises(OSError, match=words):
+        make_folder(cache_folder("banks"))
     with pytest.raises(OSError, match=r"cannot be written.*choose another folder"):
         write_file(tmp_path / "file" / "a", "")
 

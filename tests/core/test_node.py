@@ -345,8 +345,8 @@ runner.run_node(kind, sys.argv[:1] + sys.argv[2:])
 """
 
 
-def run_a_node(*arguments):
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(fresh_domain())}
+def run_a_node(*arguments, **variables):
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(fresh_domain()), **variables}
     environment["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
     command = [sys.executable, "-c", RUN_A_NODE, *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
@@ -365,6 +365,21 @@ def test_exit_code_two_is_for_parameters_and_a_defect_shows_its_traceback(argume
     assert ended.returncode == code
     assert text in ended.stderr
     assert ("Traceback" in ended.stderr) == (code == 1)
+
+
+@pytest.mark.parametrize(
+    ("variables", "text"),
+    [
+        ({"ROS_DOMAIN_ID": "seven"}, "error: ROS_DOMAIN_ID is 'seven', expected a number from 0 to 101"),
+        ({"ROS_DOMAIN_ID": "500"}, "error: ROS_DOMAIN_ID is '500', expected a number from 0 to 101"),
+        ({"ROS_LOG_DIR": "/dev/null/log"}, "error: the log folder cannot be written; set ROS_LOG_DIR to another one"),
+    ],
+)
+def test_surroundings_in_which_no_node_starts_are_one_line(variables, text):
+    ended = run_a_node("end", **variables)
+    assert ended.returncode == 2
+    assert ended.stderr.startswith(text)
+    assert len(ended.stderr.splitlines()) == 1
 
 
 def test_help_shows_how_parameters_are_given():

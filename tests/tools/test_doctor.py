@@ -58,3 +58,8 @@ def test_folders_and_a_domain_that_cannot_be_used_are_findings(tmp_path, monkeyp
     assert "XDG_CACHE_HOME" in checks["cache folder"].fix
     assert "ROS_LOG_DIR" in checks["log folder"].fix
     assert "ROS_DOMAIN_ID is 'seven'" in checks["ROS domain"].detail
+    with pytest.raises(ValueError, match="ROS_DOMAIN_ID is 'seven'"):
+        machine_doctor._exchange_message()
+    result = CliRunner().invoke(app, ["doctor", "--graph"])
+    assert result.exit_code == 2
+    assert result.stderr.startswith("active6d: ROS_DOMAIN_ID is 'seven', expected a number")

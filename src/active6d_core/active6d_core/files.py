@@ -41,6 +41,24 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder, and those that it is in, unless it is there.
+
+    Raises:
+        OSError: it cannot be made; the message says what to do.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _no_folder(path, error) from error
+
+
+def _no_folder(path: Path, error: OSError) -> OSError:
+    inside = path.is_relative_to(cache_folder(""))
+    advice = "set XDG_CACHE_HOME to another folder" if inside else "choose another folder"
+    return OSError(f"{path} cannot be written ({error.strerror}); {advice}")
+
+
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
     """Yield the path of an unfinished file; it gets the name ``path`` when the block ends without an error.
@@ -51,13 +69,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be written.
     """
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         temporary = TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.")
     except OSError as error:
-        inside = path.is_relative_to(cache_folder(""))
-        advice = "set XDG_CACHE_HOME to another folder" if inside else "choose another folder"
-        raise OSError(f"{path.parent} cannot be written ({error.strerror}); {advice}") from error
+        raise _no_folder(path.parent, error) from error
     with temporary as folder:
         unfinished = Path(folder) / path.name
         yield unfinished

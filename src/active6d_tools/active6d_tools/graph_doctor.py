@@ -1,6 +1,5 @@
 """Looks at a running graph: silent topics, incompatible QoS, and which node waits for which."""
 
-import os
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
 from active6d_core.ros.conversions import own_statuses, status_values
+from active6d_core.ros.network import domain_of, explain_start
 from active6d_core.ros.topics import CONTRACT
 from active6d_tools.machine_doctor import Check
 
@@ -31,10 +31,16 @@ def examine_graph(domain: int | None = None, namespace: str = "", seconds: float
         domain: ROS domain, None for ``ROS_DOMAIN_ID`` or 0.
         namespace: of the graph's nodes and topics.
         seconds: how long to listen: discovery takes some seconds, and nodes send a heartbeat every second.
+
+    Raises:
+        ValueError: ``ROS_DOMAIN_ID`` is no domain, or the log folder cannot be written.
     """
-    domain = int(os.environ.get("ROS_DOMAIN_ID") or 0) if domain is None else domain
+    domain = domain_of() or 0 if domain is None else domain
     context = Context()
-    context.init(args=[], domain_id=domain)
+    try:
+        context.init(args=[], domain_id=domain)
+    except RuntimeError as error:
+        raise ValueError(explain_start(error)) from error
     executor = SingleThreadedExecutor(context=context)
     listener = _Listener(context, namespace)
     executor.add_node(listener)

@@ -172,7 +172,10 @@ def _read_domain() -> str:
 
 
 def _self_tests() -> Iterator[Check]:
-    network = "allow UDP on the loopback interface, or try ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
+    network = (
+        "repair the log folder and the ROS domain first; then allow UDP on the loopback interface, or try "
+        "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
+    )
     yield _attempt("Self test", "two nodes exchange a message", _exchange_message, network)
     yield _attempt("Self test", "ray casting a view", _cast_rays, "reinstall open3d, check libusb-1.0-0 and libgl1")
     yield _attempt("Self test", "writing and reading a bag", _write_bag, PIP)
@@ -203,6 +206,7 @@ def _exchange_message() -> str:
     from rclpy.executors import SingleThreadedExecutor
     from std_msgs.msg import String
 
+    domain_of()  # the middleware would end this process
     context = Context()
     rclpy.init(context=context)
     executor = SingleThreadedExecutor(context=context)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from active6d_core.array_archive import read_archive
-from active6d_core.files import atomic_file, cache_folder
+from active6d_core.files import atomic_file, cache_folder, make_folder
 from active6d_core.interrupts import worker_pool
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import transform_from_quaternion
@@ -117,7 +117,7 @@ def build_bank(
     empty = SceneBank(object_name, sphere or ViewSphere(), grid, [], provenance or {})
     known = _scenes_of(path, empty)
     parts = path.with_suffix(".parts")
-    parts.mkdir(parents=True, exist_ok=True)
+    make_folder(parts)
     files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes if name not in known}
     missing = [name for name, file in files.items() if not _scenes_of(file, empty)]
     yield from (name for name in scenes if name not in missing)

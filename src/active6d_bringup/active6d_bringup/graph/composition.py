@@ -17,7 +17,7 @@ from rclpy.node import Node
 from active6d_core.interrupts import INTERRUPTS
 from active6d_core.nearest_name import did_you_mean
 from active6d_core.ros.graph_nodes import NODES
-from active6d_core.ros.network import DomainClaim, domain_of
+from active6d_core.ros.network import DomainClaim, domain_of, explain_start
 from active6d_core.ros.publishers import others_in_domain
 from active6d_core.structured_text import read_yaml
 
@@ -193,9 +193,9 @@ def open_context(description: GraphDescription) -> Context:
     try:
         context.init(args=description.ros_arguments(), domain_id=description.domain_id())
     except RuntimeError as error:
-        if "log" in str(error) and description.params_file == default_params_file():
-            raise ValueError(f"the log folder cannot be written; set ROS_LOG_DIR to another one ({error})") from error
-        raise ValueError(f"params file {description.params_file}: {error}") from error
+        explained = explain_start(error)
+        of_file = "" if "ROS_LOG_DIR" in explained else f"params file {description.params_file}: "
+        raise ValueError(f"{of_file}{explained}") from error
     return context
 
 

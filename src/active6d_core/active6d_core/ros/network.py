@@ -65,6 +65,13 @@ def domain_of(environment: MutableMapping[str, str] = os.environ) -> int | None:
     return int(text)
 
 
+def explain_start(error: RuntimeError) -> str:
+    """Why a ROS context could not be initialised, and what to do."""
+    if "logging" in str(error):
+        return f"the log folder cannot be written; set ROS_LOG_DIR to another one ({error})"
+    return str(error)
+
+
 class DomainClaim:
     """A domain that this process has for its graph alone, until :meth:`release` or its end.
 

@@ -4,12 +4,14 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.utilities import remove_ros_args
 
-from active6d_core.ros.network import describe_reach
+from active6d_core.ros.graph_nodes import BAD_PARAMETERS
+from active6d_core.ros.network import describe_reach, domain_of, explain_start
 from active6d_core.ros.node import GraphNode
 
 _WAKE_SECONDS = 1.0
@@ -18,7 +20,13 @@ _WAKE_SECONDS = 1.0
 def run_node(node_type: Callable[[], GraphNode], args: Sequence[str] | None = None) -> None:
     """Spin one node until interrupted. Exit code 2 on bad arguments."""
     _refuse_words(list(sys.argv if args is None else args))
-    rclpy.init(args=args)
+    try:
+        domain_of()
+        rclpy.init(args=args)
+    except ValueError as error:
+        _refuse(str(error))
+    except RuntimeError as error:
+        _refuse(explain_start(error))
     node = None
     try:
         try:
@@ -28,8 +36,7 @@ def run_node(node_type: Callable[[], GraphNode], args: Sequence[str] | None = No
                 node.start()
         # Only here: a ValueError in a callback is a defect, which needs its traceback and the supervisor's restart.
         except ValueError as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(2)
+            _refuse(str(error))
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         # Not spin(): on an interrupt rclpy wakes the executor a moment before it ends the context, and one that waits
@@ -50,6 +57,11 @@ def run_node(node_type: Callable[[], GraphNode], args: Sequence[str] | None = No
         rclpy.try_shutdown()
 
 
+def _refuse(text: str) -> NoReturn:
+    print(f"error: {text}", file=sys.stderr)
+    sys.exit(BAD_PARAMETERS)
+
+
 def _refuse_words(arguments: list[str]) -> None:
     """End with usage, or with an error: rclpy would drop silently what stands before ``--ros-args``."""
     words = remove_ros_args(arguments)[1:]
@@ -59,5 +71,4 @@ def _refuse_words(arguments: list[str]) -> None:
     if set(words) & {"-h", "--help"}:
         print(f"{usage}\nparameters and topics: docs/graph.md, or `ros2 param describe` while it runs")
         sys.exit(0)
-    print(f"error: '{words[0]}' is not for a node; parameters come after --ros-args\n{usage}", file=sys.stderr)
-    sys.exit(2)
+    _refuse(f"'{words[0]}' is not for a node; parameters come after --ros-args\n{usage}")

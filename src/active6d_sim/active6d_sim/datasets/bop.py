@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from active6d_core.camera import PinholeCamera, View
+from active6d_core.files import make_folder
 from active6d_core.images import read_color, read_depth
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform, transform_from_quaternion
 from active6d_core.structured_text import read_json
@@ -163,7 +164,7 @@ def write_bop_scene(
     if object_id < 1 or not 0 < depth_scale < np.inf:
         raise ValueError(f"BOP counts objects from 1 and scales are positive, got {object_id} and {depth_scale}")
     for kind in ("rgb", "depth"):
-        (folder / kind).mkdir(parents=True, exist_ok=True)
+        make_folder(folder / kind)
     cameras, truth = {}, {}
     for image, view in enumerate(views):
         Image.fromarray(view.color).save(folder / "rgb" / f"{image:06d}.png")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
+from active6d_core.files import make_folder
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.datasets.bop import CAMERA_FILE, write_bop_scene
@@ -75,7 +76,7 @@ def export_scenes(
 
 def write_model(folder: Path, model: ObjectModel, object_id: int = 1) -> None:
     """Write ``obj_NNNNNN.ply`` and ``models_info.json`` in millimetres, in the frame of the mesh file."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     mesh = model.mesh.copy()
     mesh.apply_translation(model.origin)
     mesh.apply_scale(_MILLIMETRES)  # type: ignore[no-untyped-call]

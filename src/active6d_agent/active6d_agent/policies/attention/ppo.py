@@ -32,7 +32,7 @@ from active6d_agent.policies.attention.network import (
     save_network,
 )
 from active6d_agent.policies.registry import Observation
-from active6d_core.files import Checkpoints, atomic_file, write_file
+from active6d_core.files import Checkpoints, atomic_file, make_folder, write_file
 
 #: The paper's length of the training and its learning rate (supplement E); batch and discount are the usual ones here.
 AS_IN_THE_PAPER = {"total": 10_000_000, "learning_rate": 1e-4}
@@ -253,7 +253,7 @@ def train_ppo(
         ValueError: there is nothing to resume from, or with other parameters.
     """
     parameters, reward = parameters or PpoParameters(), reward or RewardParameters()
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     ppo = _make_ppo(train, parameters, reward)
     identity = {"parameters": asdict(parameters) | {"total": 0}, "reward": asdict(reward)}
     curve, best, begun = folder / "curve.jsonl", (-1.0, 0.0), time.perf_counter()

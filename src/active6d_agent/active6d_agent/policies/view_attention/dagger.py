@@ -32,7 +32,7 @@ from active6d_agent.policies.view_attention.network import (
     save_network,
     value_views,
 )
-from active6d_core.files import Checkpoints
+from active6d_core.files import Checkpoints, make_folder
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 
@@ -182,7 +182,7 @@ def train_dagger(
         ValueError: there is nothing to resume from.
     """
     parameters, weighing = parameters or DaggerParameters(), weighing or Weighing()
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     learner = _Learner(train, parameters, weighing)
     curve, latest, best, begun = folder / "curve.jsonl", folder / "latest.safetensors", (-1.0, 0.0), time.perf_counter()
     if resume:

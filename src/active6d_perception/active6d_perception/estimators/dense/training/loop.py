@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from active6d_core.files import Checkpoints, atomic_file, write_file
+from active6d_core.files import Checkpoints, atomic_file, make_folder, write_file
 from active6d_core.object_model import ObjectModel
 from active6d_core.training_view import TrainingView
 from active6d_perception.estimators.dense.canonical_frame import canonical_frame_of
@@ -123,7 +123,7 @@ def train(
     Raises:
         ValueError: there are no training views, or the state in the folder is damaged or belongs to other options.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     canonical_frame = canonical_frame_of(model)
     run = _Run(model, folder, options, device)
     feed = batches(
