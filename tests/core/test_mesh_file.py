@@ -107,3 +107,26 @@ def test_what_of_a_file_is_used_otherwise_than_expected_is_said(tmp_path):
     (tmp_path / "painted.obj").write_text(f"mtllib painted.mtl\n{plain}")
     (note,) = mesh_notes(tmp_path / "painted.obj")
     assert "textures of the file are not used" in note
+
+
+def test_a_mesh_that_the_file_rounds_is_noticed(tmp_path):
+    BOX.copy().apply_translation((5000.0, 0, 0)).export(tmp_path / "far.stl")
+    (note,) = mesh_notes(tmp_path / "far.stl")
+    assert "so far from the file's origin" in note
+    BOX.copy().apply_translation((5.0, 0, 0)).export(tmp_path / "near.stl")
+    assert mesh_notes(tmp_path / "near.stl") == []
+
+
+def test_files_that_are_no_mesh_are_refused_with_their_cause(tmp_path):
+    (tmp_path / "a.stl").write_bytes(b"")
+    (tmp_path / "b.stl").write_text("<html>not found</html>")
+    with pytest.raises(ValueError, match=r"a.stl is an empty file"):
+        load_mesh(tmp_path / "a.stl")
+    with pytest.raises(ValueError, match=r"b.stl has no faces.*no mesh"):
+        load_mesh(tmp_path / "b.stl")
+
+
+def test_sizes_that_no_unit_explains_name_the_limits(tmp_path):
+    tiny = trimesh.creation.box((5e-7, 4e-7, 3e-7))
+    with pytest.raises(ValueError, match=r"not within 0\.002 to 2 m"):
+        read_description(describe(tmp_path, tiny))

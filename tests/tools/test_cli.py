@@ -49,6 +49,7 @@ def test_every_command_has_help_with_an_example(path):
     result = run(*path, "--help")
     assert result.exit_code == 0
     assert f"Example: active6d {' '.join(path)}" in result.stdout
+    assert not any(kind in result.stdout for kind in ("{policies}", "{estimators}", "{sensors}"))
 
 
 def test_without_a_command_the_help_is_shown():
@@ -192,6 +193,15 @@ def test_an_added_object_is_found_and_measured(tmp_path, monkeypatch):
     again = run("object", "add", str(mesh), "--name", "brick", "--into", str(tmp_path / "objects"))
     assert again.exit_code == 2
     assert "exists already" in again.stderr
+
+
+def test_a_mesh_that_stays_open_is_said_to_be(tmp_path):
+    mesh = trimesh.creation.icosphere(2, 0.04)
+    mesh.update_faces(np.random.default_rng(0).random(len(mesh.faces)) > 0.3)
+    mesh.export(tmp_path / "scan.ply")
+    added = run("object", "add", str(tmp_path / "scan.ply"), "--name", "scan", "--into", str(tmp_path / "objects"))
+    assert added.exit_code == 0, added.output
+    assert "edges and is used as it is" in " ".join(added.stdout.split())
 
 
 def test_a_mesh_that_is_none_leaves_nothing_behind(tmp_path):

@@ -18,6 +18,8 @@ _MOST_BODIES = 20
 #: What announces colours in OBJ, GLB and PLY, and how far a file is searched for it.
 _MATERIALS = (rb"^mtllib ", rb'"materials"\s*:', rb"^comment TextureFile", rb"^property uchar (red|texture)")
 _MARKED = 2**20
+#: Share of its size to which a mesh may be rounded: files hold coordinates of 32 bits.
+_ROUNDED = 1e-3
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres": 1.0}
 
 
@@ -39,7 +41,10 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     except Exception as error:
         raise ValueError(f"mesh {path.name} cannot be read ({error})") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise ValueError(f"mesh {path.name} has no faces; a point cloud has no surface")
+        what = (
+            "is an empty file" if not content else "has no faces; it is a point cloud, which has no surface, or no mesh"
+        )
+        raise ValueError(f"mesh {path.name} {what}")
     check_counts(path.name, len(mesh.vertices), len(mesh.faces))
     if not np.isfinite(mesh.vertices).all():
         raise ValueError(f"mesh {path.name} has vertices that are not finite")
@@ -57,6 +62,10 @@ def mesh_notes(path: Path) -> list[str]:
     bodies = len(trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces))))
     if 1 < bodies <= _MOST_BODIES and mesh.is_watertight:
         notes.append(f"the file holds {bodies} separate bodies; they are taken as one rigid object")
+    rounding = float(np.abs(mesh.vertices).max()) * np.finfo(np.float32).eps
+    if rounding > _ROUNDED * float(mesh.extents.max()):
+        share = float(mesh.extents.max()) / rounding
+        notes.append(f"it lies so far from the file's origin that its size has only {share:.0f} steps; move it there")
     if any(re.search(mark, content[:_MARKED], re.MULTILINE) for mark in _MATERIALS):
         notes.append("colours and textures of the file are not used; --color sets one colour")
     return notes
@@ -93,12 +102,16 @@ def close_mesh(mesh: trimesh.Trimesh) -> list[str]:
         if turned:
             done.append(f"{turned} of {faces} faces turned outwards")
     if not _has_inside(mesh):
-        edges = int((np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1] == 1).sum())
         raise ValueError(
-            f"mesh has no inside: it is open at {edges} edges, or its faces do not agree on what is outside; "
-            "close it in a mesh editor, such as MeshLab"
+            f"mesh has no inside: it is open at {open_edges(mesh)} edges, or its faces do not agree on what is "
+            "outside; close it in a mesh editor, such as MeshLab"
         )
     return done
+
+
+def open_edges(mesh: trimesh.Trimesh) -> int:
+    """Number of edges with a face at one side only; 0 for a closed mesh."""
+    return int((np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1] == 1).sum())
 
 
 def check_diameter(diameter: float, scale: float) -> None:
@@ -112,7 +125,8 @@ def check_diameter(diameter: float, scale: float) -> None:
         if low <= diameter / scale * factor <= high
     ]
     advice = f"; is it in {', or in '.join(fitting)}?" if fitting else ""
-    raise ValueError(f"with scale {scale:g} the object is {diameter:.4g} m in diameter{advice}")
+    limits = "" if fitting else f", and not within {low:g} to {high:g} m"
+    raise ValueError(f"with scale {scale:g} the object is {diameter:.4g} m in diameter{limits}{advice}")
 
 
 def _has_inside(mesh: trimesh.Trimesh) -> bool:

@@ -130,13 +130,15 @@ app.command(cls=PartsCommand)(ablate.ablate)
 app.command("list")(list_parts.list_parts)
 app.add_typer(bags.app, name="bag")
 app.add_typer(objects.app, name="object")
+for command in scenes.app.registered_commands:
+    command.cls = PartsCommand
 app.add_typer(scenes.app, name="scenes")
 benchmark.app.command(cls=PartsCommand)(benchmark_arm.arm)
 benchmark.app.command(cls=PartsCommand)(benchmark_estimator.estimator)
 benchmark.app.command(cls=PartsCommand)(benchmark_fusion.fusion)
 benchmark.app.command(cls=PartsCommand)(benchmark.pipeline)
 app.add_typer(benchmark.app, name="benchmark")
-train_estimator.app.command()(train_fusion.fusion)
+train_estimator.app.command(cls=PartsCommand)(train_fusion.fusion)
 train_estimator.app.command()(train_policy.policy)
 app.add_typer(train_estimator.app, name="train")
 

@@ -103,7 +103,7 @@ def add(
 
     import yaml
 
-    from active6d_core.mesh_file import close_mesh, load_mesh, mesh_notes
+    from active6d_core.mesh_file import close_mesh, load_mesh, mesh_notes, open_edges
     from active6d_sim.datasets.bop_models import symmetry_beside
 
     if not name.replace("_", "").replace("-", "").isalnum():
@@ -123,7 +123,12 @@ def add(
         description["symmetry"] = known.description
     description |= {"instances": list(instances), "color": list(color), "source": mesh.name}
     model = _store(mesh, mesh_path, description_path, yaml.safe_dump(description, sort_keys=False))
-    notes += [f"repaired each time it is loaded: {repair}" for repair in close_mesh(load_mesh(mesh))]
+    loaded = load_mesh(mesh)
+    notes += [f"repaired each time it is loaded: {repair}" for repair in close_mesh(loaded)]
+    if (edges := open_edges(loaded)) > 0:
+        notes.append(
+            f"the mesh is open at {edges} edges and is used as it is; close it in a mesh editor, such as MeshLab"
+        )
     for note in notes + ([] if known is None else _symmetry_notes(known, model, scale)):
         console.print(note, highlight=False, markup=False)
     size = " x ".join(f"{1e3 * extent:.1f}" for extent in model.mesh.extents)
