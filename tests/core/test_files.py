@@ -1,8 +1,12 @@
+import os
 from pathlib import Path
 
 import pytest
 
+from active6d_core.array_archive import read_archive, read_array
 from active6d_core.files import Checkpoints, atomic_file, cache_folder, make_folder, sha256_of, write_file
+from active6d_core.images import read_color, read_depth
+from active6d_core.structured_text import read_json, read_yaml
 
 
 def test_the_cache_follows_the_xdg_variable(monkeypatch, tmp_path):
@@ -61,6 +65,14 @@ def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):
         make_folder(cache_folder("banks"))
     with pytest.raises(OSError, match=r"cannot be written.*choose another folder"):
         write_file(tmp_path / "file" / "a", "")
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("read", [read_yaml, read_json, read_archive, read_array, read_color, read_depth])
+def test_a_pipe_is_refused_instead_of_waited_for(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe is a pipe or a device"):
+        read(tmp_path / "pipe")
 
 
 def test_a_checkpoint_is_due_when_its_time_has_passed(monkeypatch):

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.lib import format as npy
 
+from active6d_core.files import refuse_special
+
 #: Bytes of all arrays of an archive together, uncompressed.
 MOST_BYTES = 2**29
 _MOST_MEMBERS = 100
@@ -23,6 +25,7 @@ def read_archive(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, np.ndarr
         ValueError: the file is damaged, holds objects, is too large, or an array is larger than its part of the file.
         OSError: the file cannot be read.
     """
+    refuse_special(path)
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
@@ -46,6 +49,7 @@ def read_array(path: Path, most_bytes: int = MOST_BYTES) -> np.ndarray:
         ValueError: the file is damaged, holds objects or is too large.
         OSError: the file cannot be read.
     """
+    refuse_special(path)
     if path.stat().st_size > most_bytes:
         raise ValueError(f"has more than {most_bytes >> 20} MB")
     try:

@@ -41,6 +41,16 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def refuse_special(path: Path) -> None:
+    """Refuse a pipe or a device: reading one can wait for ever.
+
+    Raises:
+        ValueError: the path is of one.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise ValueError(f"{path.name} is a pipe or a device, not a file")
+
+
 def make_folder(path: Path) -> None:
     """Make a folder, and those that it is in, unless it is there.
 

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from active6d_core.files import refuse_special
+
 #: Formats that are read. Pillow knows others, some of which run other programs.
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
 #: Pixels of an image, before any of them is decoded.
@@ -60,6 +62,8 @@ def upper_bits(image: np.ndarray) -> np.ndarray:
 
 
 def _open(source: Path | bytes) -> Image.Image:
+    if isinstance(source, Path):
+        refuse_special(source)
     try:
         image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=_FORMATS)
         if image.width * image.height > _MOST_PIXELS:

@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+from active6d_core.files import refuse_special
+
 #: Bytes of a YAML text, and of a JSON file; memory is up to 30 times that.
 MOST_YAML_BYTES, MOST_JSON_BYTES = 2**20, 2**25
 _MOST_NODES = 100_000
@@ -82,6 +84,7 @@ def parse_json(text: str) -> Any:
 
 
 def _read_text(path: Path, most: int) -> str:
+    refuse_special(path)
     with path.open("rb") as file:
         content = file.read(most + 1)
     if len(content) > most:

@@ -11,6 +11,8 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 from torch import nn
 
+from active6d_core.files import refuse_special
+
 #: Bytes of a file of weights.
 MOST_BYTES = 2**28
 _MOST_HEADER_BYTES = 2**20
@@ -49,6 +51,7 @@ def read_tensors(path: Path, shapes: Mapping[str, tuple[int, ...]] | None = None
         ValueError: as :func:`load_module`.
         OSError: the file cannot be read.
     """
+    refuse_special(path)
     size = path.stat().st_size
     with path.open("rb") as file:
         header = int.from_bytes(file.read(8), "little")
