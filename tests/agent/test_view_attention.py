@@ -13,7 +13,7 @@ from synthetic_bank import synthetic_bank
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.environment.rollout import observe
-from active6d_agent.evaluation.oracle import search_views, tally, worth
+from active6d_agent.evaluation.oracle import known, search_views, tally, worth
 from active6d_agent.evaluation.policy_evaluation import all_starts, run_named, run_policy
 from active6d_agent.policies.registry import create_policy
 from active6d_agent.policies.view_attention import dagger as dagger
@@ -451,6 +451,24 @@ def test_labels_are_what_views_gain(lookup):
     assert np.nanmax(np.abs(last)) == 0.0
 
 
+@pytest.mark.parametrize("certainty", [0.0, 0.4, 1.0])
+def test_detections_count_with_their_probability(lookup, certainty):
+    """Object by object: the most probable of the poses that detect it, and the whole detection without certainty."""
+    scene, views = np.array([0, 1]), np.array([[3, 47], [20, 81]])
+    fused = lookup.fuse(scene, views, views[:, -1])
+    found = known(lookup, scene, views, certainty)
+    limit = 0.1 * lookup.model.diameter
+    for episode in range(2):
+        rows = fused.objects[episode]
+        for index in range(lookup.object_count[episode]):
+            right = [n for n, row in enumerate(rows) if row >= 0 and lookup.errors[row, index] < limit]
+            best = max((fused.probability[episode, n] for n in right), default=None)
+            expected = 0.0 if best is None else 1 - certainty + certainty * best
+            assert found[episode, index, 0] == pytest.approx(expected)
+    assert 0 < (found[..., 0] > 0).sum() < found[..., 0].size
+    assert (0 < fused.probability[fused.objects >= 0]).any()
+
+
 def test_spread_views_are_the_farthest_of_their_ring(lookup):
     sphere = lookup.sphere
     elevation = np.degrees(np.arcsin(sphere.positions[:, 2] / sphere.radius))
@@ -581,7 +599,7 @@ def test_it_learns_its_way_past_random_and_resumes(tmp_path):
     lookup = BatchedFusion(synthetic_bank("mug", scenes=3, objects=12))
     starts = all_starts(lookup, 40, 0)
     random = run_named(lookup, "random", starts, 4)
-    settings = {"episodes": 10, "updates": 60, "longest": 4, "steps": 4, "starts": 40, "batch": 48}
+    settings = {"episodes": 10, "updates": 60, "longest": 4, "steps": 4, "starts": 40, "batch": 48, "certainty": 0.0}
     parameters = dagger.DaggerParameters(rounds=4, evaluate_every=2, **settings)
     curve = list(dagger.train_dagger(lookup, lookup, tmp_path, parameters, Weighing(metres_weight=0.05)))
     assert [progress.round for progress in curve] == [2, 4]

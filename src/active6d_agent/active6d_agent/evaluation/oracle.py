@@ -9,18 +9,29 @@ from active6d_core.metrics import DETECTION_FRACTION, MISSED_E_ADD
 _CHUNK = 4096
 
 
-def known(lookup: SceneLookup, scene: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """(E, o, 2) for every true object after (E, v) views, -1 padding: 1 if it is detected, and 1 - ADD / 50 mm.
+def known(lookup: SceneLookup, scene: np.ndarray, views: np.ndarray, certainty: float = 0.0) -> np.ndarray:
+    """What is known of every true object after some views.
 
-    Zeros beyond a scene's own objects.
+    Args:
+        lookup: of the bank.
+        scene: (E,) indices.
+        views: (E, v) taken, -1 padding.
+        certainty: share of a detection that counts only with the probability of the detected pose.
+
+    Returns:
+        (E, o, 2): 1 if the object is detected, with ``certainty`` less where its probability is below 1; and
+        1 - ADD / 50 mm. Zeros beyond a scene's own objects.
     """
     parts = []
     for start in range(0, len(scene), _CHUNK):
         part = slice(start, start + _CHUNK)
-        errors = lookup.object_errors(lookup.fuse(scene[part], views[part], views[part, -1]))
+        fused = lookup.fuse(scene[part], views[part], views[part, -1])
+        of_pairs = np.where(fused.objects[..., None] >= 0, lookup.errors[fused.objects], np.inf)
+        right = of_pairs < DETECTION_FRACTION * lookup.model.diameter
+        worth = np.where(right, 1.0 - certainty * (1.0 - fused.probability[..., None]), 0.0)
+        errors = np.minimum(of_pairs.min(axis=1, initial=np.inf), MISSED_E_ADD)
         real = np.arange(errors.shape[1]) < lookup.object_count[scene[part]][:, None]
-        detected = errors < DETECTION_FRACTION * lookup.model.diameter
-        parts.append(np.stack([real & detected, real * (1.0 - errors / MISSED_E_ADD)], axis=-1))
+        parts.append(np.stack([real * worth.max(axis=1, initial=0.0), real * (1.0 - errors / MISSED_E_ADD)], axis=-1))
     return np.concatenate(parts)
 
 

@@ -79,6 +79,8 @@ class DaggerParameters:
         starts: validation episodes.
         evaluate_every: rounds between validations.
         object_weight: of the loss of single objects, against that of a view's sum.
+        certainty: share of a detection's gain that counts only with the pose's probability, in [0, 1]. Whether a pose
+            is detected changes by chance; its probability rises with every view that tells something.
         inputs: ``all``, or without what fusion knows of its certainty, to measure what that is worth: ``poses``
             (neither probability, entropy nor expected information), ``belief`` (no expected information) or
             ``information`` (neither probability nor entropy).
@@ -102,16 +104,18 @@ class DaggerParameters:
     starts: int = 300
     evaluate_every: int = 5
     object_weight: float = 1.0
+    certainty: float = 0.5
     inputs: str = "all"
     hidden: int = 32
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.explore <= 1:
-            raise ValueError(f"training: explore must be in [0, 1], got {self.explore}")
+        for name in ("explore", "certainty"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"training: {name} must be in [0, 1], got {getattr(self, name)}")
         if self.inputs not in IGNORED:
             raise ValueError(f"training: inputs must be one of {', '.join(IGNORED)}, got '{self.inputs}'")
-        for name in asdict(self).keys() - {"explore", "learning_rate", "object_weight", "inputs", "seed"}:
+        for name in asdict(self).keys() - {"certainty", "explore", "learning_rate", "object_weight", "inputs", "seed"}:
             if getattr(self, name) < 1:
                 raise ValueError(f"training: {name} must be at least 1, got {getattr(self, name)}")
         if not self.learning_rate > 0:
@@ -285,7 +289,7 @@ def spread(sphere: ViewSphere, paths: np.ndarray, moves: int) -> np.ndarray:
 
 
 def candidate_gains(
-    lookup: SceneLookup, scene: int, views: np.ndarray, left: int, clusters: np.ndarray
+    lookup: SceneLookup, scene: int, views: np.ndarray, left: int, clusters: np.ndarray, certainty: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """The gain of each view after the (v,) views taken, and that of :func:`spread` in the moves left after it.
 
@@ -298,10 +302,9 @@ def candidate_gains(
     """
     free = np.setdiff1d(np.arange(len(lookup.sphere)), views)
     paths = np.column_stack([np.tile(views, (len(free), 1)), free])
-    before = known(lookup, np.array([scene]), views[None])
-    after, ended = (
-        known(lookup, np.full(len(free), scene), each) for each in (paths, spread(lookup.sphere, paths, left - 1))
-    )
+    before = known(lookup, np.array([scene]), views[None], certainty)
+    scenes, longer = np.full(len(free), scene), spread(lookup.sphere, paths, left - 1)
+    after, ended = (known(lookup, scenes, each, certainty) for each in (paths, longer))
     fused = lookup.fuse(np.array([scene]), views[None], views[-1:])
     column, stands_for = stand_for(lookup, scene, fused, clusters)
     count = min(fused.objects.shape[1], MAX_OBJECTS) + len(clusters)
@@ -396,7 +399,14 @@ class _Learner:
             states = [represent(each, lookup.model) for each in observations]
             values = _worths(self.network, observations, states)
             gains = [
-                candidate_gains(lookup, scene[index], np.array(paths[index]), each.steps_left, state.clusters)
+                candidate_gains(
+                    lookup,
+                    scene[index],
+                    np.array(paths[index]),
+                    each.steps_left,
+                    state.clusters,
+                    self.parameters.certainty,
+                )
                 for index, each, state in zip(running, observations, states, strict=True)
             ]
             self.memory.extend(Example(state, *both) for state, both in zip(states, gains, strict=True))
