@@ -59,16 +59,24 @@ def print_summary(analysis: "EpisodeAnalysis") -> None:
     """Print one line per view, then the totals."""
     record, last = analysis.record, analysis.steps[-1]
     title = "  ".join(part for part in (record.scene or analysis.model.name, record.policy) if part)
-    columns = ["view", "camera", "moved", "hypotheses", "objects", "confirmed", "attends to"]
-    columns += ["wrong", "found", "ADD"] * bool(last.truth)
+    columns = [
+        "view",
+        "camera",
+        "moved",
+        "hypotheses",
+        "objects",
+        "confirmed",
+        "for",
+        *["found", "ADD"] * bool(last.truth),
+    ]
     rows = []
     for step in analysis.steps:
         truth = step.truth
-        attended = f"#{step.attended.index} ({step.attended.verification:.2f})" if step.attended else "-"
-        rate = [f"{truth.detected.sum()}/{len(truth.detected)}", f"{truth.mean_e_add_mm:.1f} mm"] if truth else []
-        scored = [str(step.wrong), *rate] if truth else []
+        attended = f"#{step.attended.index}" if step.attended else "-"
+        scored = [f"{truth.detected.sum()}/{len(truth.detected)}", f"{truth.mean_e_add_mm:.1f} mm"] if truth else []
         camera = f"{step.azimuth:.0f}° {step.elevation:2.0f}°"
-        counts = step.hypothesis_count, len(step.rows), len(step.confirmed)
+        confirmed = f"{len(step.confirmed)}, {step.wrong} wrong" if step.wrong else len(step.confirmed)
+        counts = step.hypothesis_count, len(step.rows), confirmed
         rows.append([str(step.number), camera, f"{step.moved_m:.2f} m", *map(str, counts), attended, *scored])
     print_table(columns, rows, title=f"[bold]{escape(title)}[/bold]")
     found = f"{len(last.rows)} objects"
