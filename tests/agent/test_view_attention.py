@@ -466,7 +466,7 @@ def test_detections_count_with_their_probability(lookup, certainty):
             expected = 0.0 if best is None else 1 - certainty + certainty * best
             assert found[episode, index, 0] == pytest.approx(expected)
     assert 0 < (found[..., 0] > 0).sum() < found[..., 0].size
-    assert (0 < fused.probability[fused.objects >= 0]).any()
+    assert (fused.probability[fused.objects >= 0] > 0).any()
 
 
 def test_spread_views_are_the_farthest_of_their_ring(lookup):
