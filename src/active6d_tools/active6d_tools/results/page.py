@@ -22,7 +22,7 @@ class Job:
         name: of the job; part of the names of its files.
         command: arguments of ``active6d``, without object and files.
         draws: whether it draws a figure.
-        trains: whether it trains, which takes hours.
+        trains: whether it trains, or needs a bank of more scenes, which takes hours.
         times: whether it measures times, and must run alone on the machine.
     """
 
@@ -54,10 +54,12 @@ class Job:
 #: Key of a report by which it is known whether its figure exists.
 _DRAWN = "is_drawn"
 
+_THIRTY = f"random,max-distance,unidirectional,entropy,lowest-score,information-gain,{PAPERS},{DEFAULT}"
 JOBS = {
     job.name: job
     for job in (
         Job("evaluate", "evaluate --policies all --steps 5"),
+        Job("evaluate_thirty", f"evaluate --policies {_THIRTY} --steps 5 --sample 1200 --banks thirty", trains=True),
         Job("evaluate_ten", "evaluate --policies random --steps 10"),
         Job(
             "steps",
@@ -173,6 +175,8 @@ BLOCKS: dict[str, Callable[[Mapping[str, Measured]], str]] = {
     "evaluate": _block("evaluate", _each(tables.policies_table)),
     "default differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate", measured)),
     "paper differences": lambda measured: _each(_against(PAPERS))(_of_job("evaluate", measured)),
+    "evaluate thirty": _block("evaluate_thirty", _each(tables.policies_table)),
+    "thirty differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate_thirty", measured)),
     "evaluate ten": _block("evaluate_ten", _each(tables.policies_table)),
     "steps": _block("steps", tables.steps_tables),
     "planning": _block("planning", _variants("detection_rate", "e_add_mm", "distance_m", "moves")),
