@@ -14,14 +14,34 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from active6d_core.ros.network import DomainClaim, DomainError, is_used
+
 # Linux hands out ephemeral ports from 32768 on, which leaves the domains 0 to 101 to DDS; 0 is everybody's default.
 _DOMAINS = 100
 _count = itertools.count()
 
 
 def fresh_domain() -> int:
-    """A ROS domain that no other test of this run and, most likely, no other process on this machine uses."""
-    return 1 + (os.getpid() * 7 + next(_count)) % _DOMAINS
+    """A ROS domain that no other test of this run and no other process on this machine uses.
+
+    Test processes that run side by side take theirs from ranges of their own.
+    """
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    share = _DOMAINS // workers
+    for _ in range(share):
+        domain = 1 + worker * share + (os.getpid() * 7 + next(_count)) % share
+        if not is_used(domain) and not _is_claimed(domain):
+            return domain
+    raise AssertionError(f"all {share} ROS domains of this test process are in use")
+
+
+def _is_claimed(domain: int) -> bool:
+    try:
+        DomainClaim(domain).release()
+    except DomainError:
+        return True
+    return False
 
 
 def reliable(latched: bool = False, depth: int = 100) -> QoSProfile:

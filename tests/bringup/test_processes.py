@@ -187,10 +187,11 @@ def test_nodes_die_with_a_killed_supervisor(graphs):
         "import sys, time; from active6d_bringup.graph.composition import GraphDescription;"
         "from active6d_core.ros.graph_nodes import NODES, NodeEntry;"
         "from active6d_bringup.graph.processes import ProcessGraph;"
-        "graph = ProcessGraph(GraphDescription({'attention_policy': {}}, domain=77));"
+        "graph = ProcessGraph(GraphDescription({'attention_policy': {}}, domain=int(sys.argv[1])));"
         "graph.start(); print(*[process.pid for process in graph.processes.values()], flush=True); time.sleep(60)"
     )
-    supervisor = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, "-c", script, str(fresh_domain())]
+    supervisor = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     nodes = [psutil.Process(int(pid)) for pid in supervisor.stdout.readline().split()]
     assert len(nodes) == 1
     supervisor.kill()

@@ -173,7 +173,7 @@ def test_a_killed_recording_is_read_and_goes_on_in_the_next_file(graph, tmp_path
     with (folder / "bag.mcap").open("ab") as file:
         file.write(b"\x06half a record")  # what a SIGKILL in the middle of a write leaves
     index = read_bag(folder)
-    assert index.damage[0] == "there is no metadata.yaml, the recording was killed"
+    assert index.damage[0] == "there is no metadata.yaml: the recording was killed, or its file was moved"
     assert "cannot be read from byte" in index.damage[1]
     assert index.settings == {"pose_estimator": {"object": "mug"}}
     assert sum(map(len, index.payloads.values())) + len(index.diagnostics) == 20

@@ -21,6 +21,7 @@ from active6d_sim.scenes.scene import Scene
 
 #: What carries the simulated camera: nothing, or this arm.
 CARRIERS = ["flying", "arm"]
+ARM_MODEL = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
 #: Largest speeds of the joints of an LBR iiwa 14 R820 from its data sheet, radians per second.
 _SPEEDS = np.radians([85.0, 85.0, 100.0, 75.0, 130.0, 135.0, 135.0])
 _SECONDS_TO_FULL_SPEED = 0.5
@@ -111,10 +112,9 @@ class CameraArm:
 
     def __init__(self, scene: Scene, settings: ArmSettings | None = None) -> None:
         self.settings = settings or ArmSettings()
-        path = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
-        self.arm = SerialArm.from_urdf(path)
+        self.arm = SerialArm.from_urdf(ARM_MODEL)
         self.joints = _READY
-        self._cell = _Cell(scene, self.arm, path, self.settings)
+        self._cell = _Cell(scene, self.arm, ARM_MODEL, self.settings)
 
     def pose(self, joints: np.ndarray) -> np.ndarray:
         """``T_world_camera`` (4, 4) at (n,) joint angles, by the calibration."""

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pybullet_data
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +16,7 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.physics.bullet import BulletClient, connect, pybullet
-from active6d_sim.robot.arm import CameraArm
+from active6d_sim.robot.arm import ARM_MODEL, CameraArm
 from active6d_sim.robot.motion import sample_way
 from active6d_sim.scenes.scene import Scene
 from active6d_sim.scenes.scene_store import load_scene
@@ -45,7 +44,7 @@ class Stage:
         self._arm, bin = arm, scene.bin
         base = arm.settings.T_world_base
         self._robot = self._client.loadURDF(
-            str(Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"),
+            str(ARM_MODEL),
             base[:3, 3].tolist(),
             quaternion_from_transform(base).tolist(),
             useFixedBase=True,
