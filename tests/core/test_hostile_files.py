@@ -134,6 +134,7 @@ def test_the_diameter_of_a_smooth_mesh_takes_little_memory():
         ("[" * 100 + "]" * 100, "inside one another"),
         ("- 1\n" * 200_000, "more than"),
         ("a: !!python/object/apply:os.system [ls]\n", "not YAML"),
+        ("a: !!timestamp x\n", "not YAML"),
         ("a: " + "9" * 5000, "digits"),
         ("x" * 2**21, "characters"),
     ],

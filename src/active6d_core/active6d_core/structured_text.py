@@ -47,7 +47,7 @@ def parse_yaml(text: str) -> Any:
     except yaml.YAMLError as error:
         raise ValueError(f"not YAML: {' '.join(str(error).split())}") from error
     # Constructors of numbers and dates raise many kinds of errors.
-    except (ArithmeticError, LookupError, RecursionError, TypeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError) as error:
         raise ValueError(f"not YAML: {type(error).__name__} {error}") from error
 
 
