@@ -24,7 +24,7 @@ results: setup  ## what docs/results.md shows and is not measured yet, except tr
 	$(BIN)/python -m active6d_tools.results.reproduce
 
 test: setup  ## all tests
-	$(BIN)/python -m pytest tests
+	$(BIN)/python -m pytest tests -n 2 --dist loadfile
 
 battery: setup  ## attacks on stamps, messages, bags and views for 20 minutes
 	$(BIN)/python tests/battery.py --seconds 1200
