@@ -197,10 +197,13 @@ class SceneLookup:
         left = np.bitwise_or.reduce(surface[views], axis=0) & ~explained
         return shown[np.unpackbits(left, count=len(shown)).view(bool)]
 
+    def pair_errors(self, fused: FusedBatch) -> np.ndarray:
+        """(E, n, o) ADD of each accumulated object to each true one, metres, ``inf`` from 50 mm on and for padding."""
+        return np.where(fused.objects[..., None] >= 0, self.errors[fused.objects], np.inf)
+
     def object_errors(self, fused: FusedBatch) -> np.ndarray:
         """(E, o) ADD of each true object's best accumulated hypothesis, metres, at most 50 mm."""
-        errors = np.where(fused.objects[..., None] >= 0, self.errors[fused.objects], np.inf)
-        return np.minimum(errors.min(axis=1, initial=np.inf), MISSED_E_ADD)
+        return np.minimum(self.pair_errors(fused).min(axis=1, initial=np.inf), MISSED_E_ADD)
 
     def evaluate(self, fused: FusedBatch, scene: np.ndarray) -> list[SceneScore]:
         """The paper's measures of every episode, hypotheses matched to objects one-to-one."""

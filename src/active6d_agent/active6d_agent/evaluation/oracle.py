@@ -26,10 +26,9 @@ def known(lookup: SceneLookup, scene: np.ndarray, views: np.ndarray, certainty: 
     for start in range(0, len(scene), _CHUNK):
         part = slice(start, start + _CHUNK)
         fused = lookup.fuse(scene[part], views[part], views[part, -1])
-        of_pairs = np.where(fused.objects[..., None] >= 0, lookup.errors[fused.objects], np.inf)
-        right = of_pairs < DETECTION_FRACTION * lookup.model.diameter
+        right = lookup.pair_errors(fused) < DETECTION_FRACTION * lookup.model.diameter
         worth = np.where(right, 1.0 - certainty * (1.0 - fused.probability[..., None]), 0.0)
-        errors = np.minimum(of_pairs.min(axis=1, initial=np.inf), MISSED_E_ADD)
+        errors = lookup.object_errors(fused)
         real = np.arange(errors.shape[1]) < lookup.object_count[scene[part]][:, None]
         parts.append(np.stack([real * worth.max(axis=1, initial=0.0), real * (1.0 - errors / MISSED_E_ADD)], axis=-1))
     return np.concatenate(parts)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from active6d_agent.policies.registry import Decision, Observation, Policy
+from active6d_core.episode_views import views_from
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.view_sphere import ViewSphere
 
@@ -87,9 +88,7 @@ class EpisodeState:
 
     def views_from(self, stamp: int) -> dict[int, np.ndarray]:
         """Stamp (ns) to position of the view of ``stamp`` and of those taken after it; empty without that view."""
-        stamps = list(self._positions)
-        first = stamps.index(stamp) if stamp in self._positions else len(stamps)
-        return {at: self._positions[at] for at in stamps[first:]}
+        return views_from(self._positions, stamp)
 
     def decide(self, policy: Policy, objects: SceneObjects, unexplained: np.ndarray) -> tuple[Decision | None, str]:
         """The policy's decision on the last view, and why the episode ends: empty text when the decision is a goal.

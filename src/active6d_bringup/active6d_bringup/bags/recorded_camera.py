@@ -99,11 +99,13 @@ def import_camera(path: Path, options: CameraOptions = CameraOptions()) -> Recor
             for topic, payload in _messages(view).items():
                 payloads[topic][view.stamp] = payload
                 received[topic][view.stamp] = view.stamp
-    reasons_given = {with_options(reason): count for reason, count in left_out.items()}
+    given: Counter[str] = Counter()
+    for reason, count in left_out.items():  # several may become one
+        given[with_options(reason)] += count
     if not payloads:
-        reasons = "; ".join(f"{count} left out: {reason}" for reason, count in Counter(reasons_given).most_common(5))
+        reasons = "; ".join(f"{count} left out: {reason}" for reason, count in given.most_common(5))
         raise BagError(f"{path}: no usable view of {topics} ({reasons or 'no images'})")
-    return RecordedCamera(topics, dict(payloads), dict(received), reasons_given, [with_options(note) for note in notes])
+    return RecordedCamera(topics, dict(payloads), dict(received), dict(given), [with_options(note) for note in notes])
 
 
 def _scan(source: BagSource, topics: CameraTopics) -> _Scan:

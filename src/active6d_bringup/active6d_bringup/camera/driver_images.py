@@ -9,32 +9,29 @@ import numpy as np
 from active6d_core.images import read_color, read_depth, upper_bits
 from active6d_core.ros.conversions import COLOR_ENCODINGS, MessageError, image_to_color, image_to_pixels
 
-#: ROS encoding to channels and OpenCV's conversion to RGB, None for none.
-_CONVERSIONS = {
-    "mono8": (1, cv2.COLOR_GRAY2RGB),
-    "8UC1": (1, cv2.COLOR_GRAY2RGB),
-    "8UC3": (3, cv2.COLOR_BGR2RGB),
-    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
-    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
-    # OpenCV names Bayer patterns by their second row and column.
-    "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),
-    "bayer_bggr8": (1, cv2.COLOR_BayerRG2RGB),
-    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),
-    "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
+# OpenCV names Bayer patterns by their second row and column.
+_BAYER = {
+    "rggb": cv2.COLOR_BayerBG2RGB,
+    "bggr": cv2.COLOR_BayerRG2RGB,
+    "gbrg": cv2.COLOR_BayerGR2RGB,
+    "grbg": cv2.COLOR_BayerGB2RGB,
 }
-#: The same for 16 bits a channel, of which the upper ones are kept.
-_CONVERSIONS_16 = {
-    "mono16": (1, cv2.COLOR_GRAY2RGB),
-    "rgb16": (3, None),
-    "bgr16": (3, cv2.COLOR_BGR2RGB),
-    "rgba16": (4, cv2.COLOR_RGBA2RGB),
-    "bgra16": (4, cv2.COLOR_BGRA2RGB),
-    "bayer_rggb16": (1, cv2.COLOR_BayerBG2RGB),
-    "bayer_bggr16": (1, cv2.COLOR_BayerRG2RGB),
-    "bayer_gbrg16": (1, cv2.COLOR_BayerGR2RGB),
-    "bayer_grbg16": (1, cv2.COLOR_BayerGB2RGB),
+#: ROS encoding to the type of its numbers, its channels, and OpenCV's conversion to RGB, None for none.
+_CONVERSIONS = {
+    "mono8": ("u1", 1, cv2.COLOR_GRAY2RGB),
+    "8UC1": ("u1", 1, cv2.COLOR_GRAY2RGB),
+    "8UC3": ("u1", 3, cv2.COLOR_BGR2RGB),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+    "mono16": ("u2", 1, cv2.COLOR_GRAY2RGB),
+    "rgb16": ("u2", 3, None),
+    "bgr16": ("u2", 3, cv2.COLOR_BGR2RGB),
+    "rgba16": ("u2", 4, cv2.COLOR_RGBA2RGB),
+    "bgra16": ("u2", 4, cv2.COLOR_BGRA2RGB),
+    **{f"bayer_{pattern}8": ("u1", 1, conversion) for pattern, conversion in _BAYER.items()},
+    **{f"bayer_{pattern}16": ("u2", 1, conversion) for pattern, conversion in _BAYER.items()},
 }
 _DEPTH_TYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "64FC1": "f8"}
 _PNG = b"\x89PNG"
@@ -52,13 +49,12 @@ def decode_color(message: Any) -> np.ndarray:
         return _refused_as_message(lambda: read_color(bytes(message.data)), message.format)
     if message.encoding in COLOR_ENCODINGS:
         return image_to_color(message)
-    sixteen = message.encoding in _CONVERSIONS_16
-    if not sixteen and message.encoding not in _CONVERSIONS:
-        usable = ", ".join([*COLOR_ENCODINGS, *_CONVERSIONS, *_CONVERSIONS_16])
+    if message.encoding not in _CONVERSIONS:
+        usable = ", ".join([*COLOR_ENCODINGS, *_CONVERSIONS])
         raise MessageError(f"colour encoding '{message.encoding}' is not one of {usable}")
-    channels, conversion = (_CONVERSIONS_16 if sixteen else _CONVERSIONS)[message.encoding]
-    pixels = image_to_pixels(message, np.dtype("u2" if sixteen else "u1"), channels)
-    if sixteen:
+    kind, channels, conversion = _CONVERSIONS[message.encoding]
+    pixels = image_to_pixels(message, np.dtype(kind), channels)
+    if kind == "u2":
         pixels = upper_bits(pixels)
     return pixels if conversion is None else cv2.cvtColor(pixels, conversion)
 

@@ -15,6 +15,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from active6d_core.episode_views import views_from
 from active6d_core.se3 import invert, make_transform, transform_points
 from active6d_perception.compiled import compiled
 from active6d_perception.scene.measured_view import NORMAL, MeasuredView, move_view
@@ -102,9 +103,7 @@ class CameraAlignment:
 
     def forget_before(self, stamp: int) -> None:
         """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
-        known = list(self._views)
-        first = known.index(stamp) if stamp in self._views else len(known)
-        self._views = {each: self._views[each] for each in known[first:]}
+        self._views = views_from(self._views, stamp)
 
     def add_view(self, stamp: int, measured: MeasuredView) -> MeasuredView:
         """Align a view with those added before.

@@ -12,6 +12,7 @@ from itertools import product
 import numpy as np
 
 from active6d_core.camera import PinholeCamera, pixel_rays, project
+from active6d_core.episode_views import views_from
 from active6d_core.object_model import ObjectModel
 from active6d_perception.compiled import compiled
 from active6d_perception.model.model_views import ray_caster
@@ -234,9 +235,7 @@ class ObservedSurface:
 
     def forget_before(self, stamp: int) -> None:
         """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
-        known = list(self._seen)
-        first = known.index(stamp) if stamp in self._seen else len(known)
-        self._seen = {each: self._seen[each] for each in known[first:]}
+        self._seen = views_from(self._seen, stamp)
 
     def unexplained(self, T_world_object: np.ndarray) -> np.ndarray:
         """(k, 3) centres of the unexplained cells: seen, and not near any of (n, 4, 4) poses; world, metres."""

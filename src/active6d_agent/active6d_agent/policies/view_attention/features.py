@@ -14,7 +14,7 @@ import scipy.stats
 import torch
 from scipy.spatial.distance import cdist
 
-from active6d_agent.policies.registry import MAX_OBJECTS, Observation
+from active6d_agent.policies.registry import MAX_OBJECTS, Decision, Observation
 from active6d_core.object_model import ObjectModel
 from active6d_perception.compiled import compiled
 from active6d_perception.model.model_views import model_views
@@ -142,6 +142,21 @@ class SceneState:
 def best_verified(observation: Observation) -> np.ndarray:
     """Indices of the objects that count, the best verified first, at most ``MAX_OBJECTS``."""
     return np.argsort(-observation.objects.verification, kind="stable")[:MAX_OBJECTS]
+
+
+def go_for_items(observation: Observation, view: int, share: np.ndarray) -> Decision:
+    """Move to a view of the grid whose worth is due to several items; the attention is each object's share of it.
+
+    Args:
+        observation: of the items.
+        view: index in the grid.
+        share: of the objects in the order of :func:`best_verified`, then of what has no pose yet; not negative. A move
+            that is mostly for such an item attends to no object.
+    """
+    best, attention = best_verified(observation), np.zeros(len(observation.objects))
+    attention[best] = share[: len(best)]
+    largest = int(share.argmax()) if share.any() else len(best)
+    return Decision.go_to(observation, view, attention, int(best[largest]) if largest < len(best) else None)
 
 
 def cluster_unexplained(points: np.ndarray, diameter: float) -> np.ndarray:

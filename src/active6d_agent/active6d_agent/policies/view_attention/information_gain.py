@@ -6,7 +6,7 @@ It needs no training, so it serves objects without a trained policy, and shows w
 import numpy as np
 
 from active6d_agent.policies.registry import Decision, DeterministicPolicy, Observation, register_policy
-from active6d_agent.policies.view_attention.features import INFORMATION, best_verified, gather, represent
+from active6d_agent.policies.view_attention.features import INFORMATION, gather, go_for_items, represent
 from active6d_core.object_model import ObjectModel
 
 
@@ -35,7 +35,7 @@ class InformationGainPolicy(DeterministicPolicy):
 
     def decide(self, observation: Observation) -> Decision:
         """The view of most information. The attention is each object's share of it."""
-        candidates, best = observation.candidates(), best_verified(observation)
+        candidates = observation.candidates()
         told = gather([represent(observation, self._model)])["pairs"][0, ..., INFORMATION].double().numpy()
         information = np.where(candidates, told.sum(axis=1), -np.inf)
         if not candidates.any() or information.max() < self._stop_below:
@@ -44,9 +44,4 @@ class InformationGainPolicy(DeterministicPolicy):
         worth = information - self._metres_weight * sphere.arc(sphere.positions, observation.positions[-1])
         # Views of equal value differ by rounding, which must not decide.
         view = int(np.round(worth, 5).argmax())
-        share = told[view] / max(told[view].sum(), np.finfo(float).tiny)
-        attention = np.zeros(len(observation.objects))
-        attention[best] = share[: len(best)]
-        # A move for what has no pose yet attends to no object.
-        attended = int(best[share.argmax()]) if share.any() and share.argmax() < len(best) else None
-        return Decision.go_to(observation, view, attention, attended)
+        return go_for_items(observation, view, told[view] / max(told[view].sum(), np.finfo(float).tiny))

@@ -28,8 +28,8 @@ from active6d_agent.policies.view_attention.features import (
     PAIR_FEATURES,
     VIEW_FEATURES,
     SceneState,
-    best_verified,
     gather,
+    go_for_items,
     represent,
 )
 from active6d_core.hypotheses import SceneObjects
@@ -277,10 +277,4 @@ class ViewAttentionPolicy(DeterministicPolicy):
         if most == -np.inf or (self._stop_below > 0 and most < self._stop_below):
             return Decision.stop_here(observation)
         view = int(values.worth[0].argmax())
-        attention = np.zeros(len(observation.objects))
-        best = best_verified(observation)
-        share = values.share[0, view]
-        attention[best] = share[: len(best)]
-        # A move for what has no pose yet attends to no object.
-        attended = int(best[share.argmax()]) if share.argmax() < len(best) and share.any() else None
-        return Decision.go_to(observation, view, attention, attended)
+        return go_for_items(observation, view, values.share[0, view])
