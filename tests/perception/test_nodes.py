@@ -385,7 +385,7 @@ def test_fusion_without_a_writable_cache_sends_no_markers(graph, seen, tmp_path,
     (tmp_path / "cache").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     objects, markers = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(MarkerArray, "objects/markers", True)
-    logged = graph.mailbox(Log, "/rosout")
+    logged = graph.mailbox(Log, "/rosout", latched=True)
     graph.add(HypothesisFusionNode(context=graph.context))
     send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
     graph.spin_until_filled([objects, markers])
