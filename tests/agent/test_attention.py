@@ -206,6 +206,60 @@ def test_the_export_is_the_trained_policy(lookup):
     torch.testing.assert_close(again[1], log_prob)
 
 
+def make_policy(lookup, **keywords):
+    environment = BankVecEnv(Active6DVectorEnv(lookup, 6))
+    environment.seed(0)
+    torch.manual_seed(4)
+    policy = PaperPolicy(environment.observation_space, environment.action_space, lambda _: 1e-4, **keywords)
+    return policy, {name: torch.from_numpy(values) for name, values in environment.reset().items()}
+
+
+def test_the_export_of_standardised_features_takes_raw_ones(lookup):
+    rng = np.random.default_rng(8)
+    statistics = {"mean": rng.random(6), "deviation": rng.uniform(0.05, 2.0, 6)}
+    policy, tensors = make_policy(lookup, features_extractor_kwargs=statistics)
+    tensors["mask"][0] = tensors["objects"][0] = 0.0  # an episode without objects
+    with torch.inference_mode():
+        actions = policy.forward(tensors, deterministic=True)[0]
+        mean, _, index = policy.network()(tensors)
+    torch.testing.assert_close(actions[:, :2], mean, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(actions[:, 2].long(), index)
+
+
+def test_with_credit_the_attended_object_is_drawn_and_has_a_probability(lookup):
+    policy, tensors = make_policy(lookup, credit=True)
+    tensors["mask"][0] = tensors["objects"][0] = 0.0
+    with torch.no_grad():
+        policy.features_extractor.attention.selector.weight *= 20.0  # weights that differ
+        drawn = [policy.forward(tensors) for _ in range(400)]
+        _, weight, most = policy.features_extractor.attention(tensors["objects"], tensors["mask"])
+        index = torch.stack([actions[:, 2].long() for actions, _, _ in drawn])
+        share = torch.stack([(index == each).float().mean(dim=0) for each in range(weight.shape[1])], dim=1)
+        torch.testing.assert_close(share[1:], weight[1:], atol=0.12, rtol=0.0)
+        assert (index[:, 0] == weight.shape[1] - 1).all(), "without objects the last index is certain"
+        actions, values, log_probability = drawn[0]
+        again = policy.evaluate_actions(tensors, actions)
+        torch.testing.assert_close(again[0], values)
+        torch.testing.assert_close(again[1], log_probability)
+        # Against the same state with that index, as if it were certain.
+        latent = policy.mlp_extractor.forward_actor(policy.features_extractor(tensors, index[0]))
+        angles = policy._get_action_dist_from_latent(latent).log_prob(actions[:, :2])
+        chosen = torch.where(torch.arange(6) > 0, weight[torch.arange(6), index[0]].log(), 0.0)
+        torch.testing.assert_close(log_probability, angles + chosen)
+        # The value does not know which object was drawn.
+        torch.testing.assert_close(torch.stack([each for _, each, _ in drawn]).std(dim=0).max(), torch.tensor(0.0))
+        torch.testing.assert_close(policy.forward(tensors, deterministic=True)[0][:, 2].long(), most)
+
+
+def test_statistics_of_returns_outlive_an_interruption(lookup, tmp_path):
+    settings = {"environments": 8, "rollout": 5, "batch": 20, "evaluate_every": 40, "credit": True, "normalise": True}
+    list(train_ppo(lookup, lookup, tmp_path, PpoParameters(total=40, **settings)))
+    count = json.loads((tmp_path / "latest.json").read_text())["returns"][2]
+    assert count == pytest.approx(40, abs=1e-3)
+    list(train_ppo(lookup, lookup, tmp_path, PpoParameters(total=80, **settings), resume=True))
+    assert json.loads((tmp_path / "latest.json").read_text())["returns"][2] == pytest.approx(80, abs=1e-3)
+
+
 def test_an_interrupted_training_goes_on_between_evaluations(lookup, tmp_path, monkeypatch):
     settings = {"environments": 8, "rollout": 5, "batch": 20, "evaluate_every": 40, "seed": 3}
     monkeypatch.setattr("active6d_core.files.Checkpoints.due", lambda self: True)

@@ -46,12 +46,15 @@ class ObjectAttention(nn.Module):
         self.fc = nn.Sequential(nn.Linear(FEATURES, FEATURES), nn.ReLU())
         self.selector = nn.Linear(2 * FEATURES, 1)
 
-    def forward(self, objects: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def forward(
+        self, objects: torch.Tensor, mask: torch.Tensor, index: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Attend to one object of each scene.
 
         Args:
             objects: (B, N, 6) features, padded.
             mask: (B, N) 1 for an object, 0 for padding.
+            index: (B,) the object that is attended instead of the one with the largest weight.
 
         Returns:
             (B, 12) o_t, zeros without objects; (B, N) weights, zero for padding; (B,) index m, N - 1 without objects.
@@ -66,7 +69,7 @@ class ObjectAttention(nn.Module):
         if self.rule == "lowest-score":
             lowest = objects[..., -1].masked_fill(~present, torch.inf).argmin(dim=1)
             weight = nn.functional.one_hot(lowest, objects.shape[1]).to(objects.dtype) * present
-        index = weight.argmax(dim=1)
+        index = weight.argmax(dim=1) if index is None else index
         rows = torch.arange(len(objects), device=objects.device)
         some = present.any(dim=1)
         attended = torch.cat([g[rows, index] * weight[rows, index, None], objects[rows, index]], dim=1)

@@ -15,7 +15,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
 from active6d_agent.bank.scene_lookup import SceneLookup
@@ -23,7 +23,7 @@ from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.environment.gym_environment import Active6DVectorEnv, horizon
 from active6d_agent.environment.rollout import measure, roll_out
 from active6d_agent.evaluation.policy_evaluation import all_starts
-from active6d_agent.policies.attention.encoding import decode
+from active6d_agent.policies.attention.encoding import FEATURES, decode
 from active6d_agent.policies.attention.network import (
     ATTENTION_RULES,
     AttentionNetwork,
@@ -55,6 +55,10 @@ class PpoParameters:
         seed: of the weights, the episodes and the batches.
         evaluate_every: environment steps between evaluations on the validation scenes.
         attend: rule for the attended object, see :class:`~active6d_agent.policies.attention.network.ObjectAttention`.
+        credit: draw the attended object from the attention's weights during training, so that the choice has a
+            probability and is rewarded; the paper's has none.
+        normalise: standardise the objects' features and divide rewards by the deviation of returns.
+        log_deviation: natural logarithm of the Gaussian's deviation at the beginning.
 
     Raises:
         ValueError: a value is out of range.
@@ -72,6 +76,9 @@ class PpoParameters:
     seed: int = 0
     evaluate_every: int = 50_000
     attend: str = "learned"
+    credit: bool = False
+    normalise: bool = False
+    log_deviation: float = -0.5
 
     def __post_init__(self) -> None:
         for name in ("steps", "total", "environments", "rollout", "batch", "epochs", "evaluate_every"):
@@ -139,29 +146,69 @@ class BankVecEnv(VecEnv):
 
 
 class AttentionExtractor(BaseFeaturesExtractor):
-    """The state s_t; remembers the index that the attention chose last, which is part of the action."""
+    """The state s_t; remembers what the attention chose last, which is part of the action.
 
-    def __init__(self, observation_space: spaces.Dict, rule: str = "learned") -> None:
+    Args:
+        observation_space: of the environment.
+        rule: of :class:`~active6d_agent.policies.attention.network.ObjectAttention`.
+        mean: (6,) of the objects' features, subtracted; zeros when None.
+        deviation: (6,) of the features, which divides them; ones when None.
+
+    Attributes:
+        attended: (B,) index of the attended object.
+        weight: (B, N) the attention's weights.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        rule: str = "learned",
+        mean: np.ndarray | None = None,
+        deviation: np.ndarray | None = None,
+    ) -> None:
         self.steps = horizon(observation_space)
         super().__init__(observation_space, 15 + 3 * self.steps)
         self.attention = ObjectAttention(rule)
+        self.register_buffer("mean", torch.zeros(FEATURES) if mean is None else torch.from_numpy(mean).float())
+        unit = torch.ones(FEATURES) if deviation is None else torch.from_numpy(deviation).float()
+        self.register_buffer("deviation", unit)
         self.attended = torch.zeros(0, dtype=torch.long)
+        self.weight = torch.zeros(0, 0)
 
-    def forward(self, observation: dict[str, torch.Tensor]) -> torch.Tensor:
-        """(B, 15 + 3 T)."""
-        attended, _, self.attended = self.attention(observation["objects"], observation["mask"])
+    mean: torch.Tensor
+    deviation: torch.Tensor
+
+    def forward(self, observation: dict[str, torch.Tensor], index: torch.Tensor | None = None) -> torch.Tensor:
+        """(B, 15 + 3 T); ``index`` (B,) is attended in place of the object with the largest weight."""
+        objects, mask = (observation["objects"] - self.mean) / self.deviation, observation["mask"]
+        attended, self.weight, self.attended = self.attention(objects, mask, index)
+        # Without objects, the features are zeros before they are standardised.
+        nothing = torch.cat([torch.zeros_like(self.mean), -self.mean / self.deviation])
+        attended = torch.where(mask.any(dim=1, keepdim=True), attended, nothing)
         return torch.cat([attended, observation["camera"], observation["history"].flatten(1)], dim=1)
+
+    def fold(self, weight: torch.Tensor, bias: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Weights and bias for raw features, of a layer whose inputs are (6,) standardised ones."""
+        scaled = weight / self.deviation
+        return scaled, bias - scaled @ self.mean
 
 
 class PaperPolicy(ActorCriticPolicy):
     """128 ReLU units, a Gaussian over the two angles; the third component of an action is the attended index.
 
-    The index follows from the state, so it has no probability of its own: the attention learns through o_t, whose
-    gradient flows from the policy through the weight (Algorithm 1).
+    In the paper, the index follows from the state, so it has no probability of its own: the attention learns through
+    o_t, whose gradient flows from the policy through the weight (Algorithm 1). With ``credit`` it is drawn from the
+    weights. The value is always that of the state in which the largest weight attends: a value that knew the drawn
+    index would take the credit from it.
     """
 
     def __init__(
-        self, observation_space: spaces.Dict, action_space: spaces.Box, lr_schedule: Schedule, **keywords: Any
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        credit: bool = False,
+        **keywords: Any,
     ) -> None:
         angles = spaces.Box(action_space.low[:2], action_space.high[:2])
         settings = {
@@ -170,37 +217,66 @@ class PaperPolicy(ActorCriticPolicy):
             "activation_fn": nn.ReLU,
             "log_std_init": -0.5,
         }
-        super().__init__(observation_space, angles, lr_schedule, **{**keywords, **settings})
-        self.action_space = action_space
+        super().__init__(observation_space, angles, lr_schedule, **{**settings, **keywords})
+        self.action_space, self.credit = action_space, credit
 
     features_extractor: AttentionExtractor
 
     def forward(self, obs: Any, deterministic: bool = False) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Actions (B, 3), values (B, 1) and log probabilities (B,)."""
-        latent_pi, latent_vf = self.mlp_extractor(self.extract_features(obs))
-        distribution = self._get_action_dist_from_latent(latent_pi)
+        extractor = self.features_extractor
+        state = extractor(obs)
+        values = self.value_net(self.mlp_extractor.forward_critic(state))
+        index = extractor.attended
+        choice = self._choice(obs)
+        if choice and not deterministic:
+            index = choice.sample()
+            state = extractor(obs, index)
+        distribution = self._get_action_dist_from_latent(self.mlp_extractor.forward_actor(state))
         angles = distribution.get_actions(deterministic=deterministic)
-        return self._with_index(angles), self.value_net(latent_vf), distribution.log_prob(angles)
+        log_probability = distribution.log_prob(angles)
+        if choice:
+            log_probability = log_probability + choice.log_prob(index)
+        return torch.cat([angles, index[:, None].to(angles.dtype)], dim=1), values, log_probability
 
     def evaluate_actions(
         self, obs: Any, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Values, log probabilities and entropies of (B, 3) actions, of which only the angles count."""
-        return super().evaluate_actions(obs, actions[:, :2])
+        """Values, log probabilities and entropies of (B, 3) actions; the index counts with ``credit`` only."""
+        state = self.features_extractor(obs)
+        values = self.value_net(self.mlp_extractor.forward_critic(state))
+        choice, index = self._choice(obs), actions[:, 2].round().long()
+        if choice:
+            state = self.features_extractor(obs, index)
+        distribution = self._get_action_dist_from_latent(self.mlp_extractor.forward_actor(state))
+        log_probability, entropy = distribution.log_prob(actions[:, :2]), distribution.entropy()
+        if choice and entropy is not None:
+            log_probability, entropy = log_probability + choice.log_prob(index), entropy + choice.entropy()
+        return values, log_probability, entropy
 
     def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
-        angles = self.get_distribution(observation).get_actions(deterministic=deterministic)
-        return self._with_index(angles)
+        return self(observation, deterministic)[0]
 
-    def _with_index(self, angles: torch.Tensor) -> torch.Tensor:
-        return torch.cat([angles, self.features_extractor.attended[:, None].to(angles.dtype)], dim=1)
+    def _choice(self, obs: dict[str, torch.Tensor]) -> torch.distributions.Categorical | None:
+        """The distribution that the attended index is drawn from, after the extractor ran; None if it is not drawn."""
+        if not self.credit:
+            return None
+        # Without objects, the last index is certain, as in the attention.
+        weight, none = self.features_extractor.weight, ~(obs["mask"] > 0).any(dim=1)
+        last = nn.functional.one_hot(torch.tensor(weight.shape[1] - 1), weight.shape[1]).to(weight)
+        return torch.distributions.Categorical(torch.where(none[:, None], last, weight))
 
     def network(self) -> AttentionNetwork:
-        """The deployable part, a copy."""
+        """The deployable part, a copy; it takes raw features."""
         extractor = self.features_extractor
         network = AttentionNetwork(extractor.steps, rule=extractor.attention.rule)
         network.attention.load_state_dict(extractor.attention.state_dict())
         network.policy.load_state_dict(self.mlp_extractor.policy_net.state_dict())
+        with torch.no_grad():
+            fc, first = cast(nn.Linear, network.attention.fc[0]), cast(nn.Linear, network.policy[0])
+            fc.weight[:], fc.bias[:] = extractor.fold(fc.weight, fc.bias)
+            raw = slice(FEATURES, 2 * FEATURES)
+            first.weight[:, raw], first.bias[:] = extractor.fold(first.weight[:, raw], first.bias)
         network.mean.load_state_dict(self.action_net.state_dict())
         network.log_std.data.copy_(self.log_std.data)
         return network.eval()
@@ -299,11 +375,21 @@ def _learn(ppo: PPO, until: int, keep: Callable[[], None]) -> None:
 
 
 def _make_ppo(lookup: SceneLookup, parameters: PpoParameters, reward: RewardParameters) -> PPO:
-    environment = BankVecEnv(Active6DVectorEnv(lookup, parameters.environments, steps=parameters.steps, reward=reward))
+    environment: VecEnv = BankVecEnv(
+        Active6DVectorEnv(lookup, parameters.environments, steps=parameters.steps, reward=reward)
+    )
+    extractor: dict[str, Any] = {"rule": parameters.attend}
+    if parameters.normalise:
+        extractor["mean"], extractor["deviation"] = _feature_statistics(environment, parameters.seed)
+        environment = VecNormalize(environment, norm_obs=False, gamma=parameters.gamma)
     return PPO(
         PaperPolicy,
         environment,
-        policy_kwargs={"features_extractor_kwargs": {"rule": parameters.attend}},
+        policy_kwargs={
+            "features_extractor_kwargs": extractor,
+            "credit": parameters.credit,
+            "log_std_init": parameters.log_deviation,
+        },
         learning_rate=parameters.learning_rate,
         n_steps=parameters.rollout,
         batch_size=parameters.batch,
@@ -312,6 +398,16 @@ def _make_ppo(lookup: SceneLookup, parameters: PpoParameters, reward: RewardPara
         ent_coef=parameters.entropy,
         seed=parameters.seed,
     )
+
+
+def _feature_statistics(environment: VecEnv, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """(6,) mean and (6,) deviation of the objects' features in the first views of episodes."""
+    environment.seed(seed)
+    observation = cast(dict[str, np.ndarray], environment.reset())
+    present = observation["objects"][observation["mask"] > 0].astype(float)
+    if not len(present):
+        return np.zeros(FEATURES), np.ones(FEATURES)
+    return present.mean(axis=0), np.maximum(present.std(axis=0), 1e-3)
 
 
 def validate(network: AttentionNetwork, lookup: SceneLookup, steps: int) -> tuple[float, float, float]:
@@ -337,6 +433,10 @@ def _checkpoint(ppo: PPO, folder: Path, state: dict[str, Any]) -> None:
     cloned = {name: value.detach().cpu().clone() for name, value in tensors.items()}
     with atomic_file(folder / "latest.safetensors") as unfinished:
         save_file(cloned, unfinished)
+    environment = ppo.env
+    if isinstance(environment, VecNormalize):
+        returns = environment.ret_rms
+        state = {**state, "returns": [float(returns.mean), float(returns.var), float(returns.count)]}
     write_file(folder / "latest.json", json.dumps({**state, "steps": ppo.num_timesteps}, indent=2) + "\n")
 
 
@@ -356,6 +456,10 @@ def _restore(ppo: PPO, folder: Path, identity: dict[str, Any]) -> tuple[tuple[fl
             _, index, name = key.split(".")
             adam.setdefault(int(index), {})[name] = value
     ppo.policy.optimizer.load_state_dict({**ppo.policy.optimizer.state_dict(), "state": adam})
+    if isinstance(ppo.env, VecNormalize):
+        returns = ppo.env.ret_rms
+        mean, variance, returns.count = state["returns"]
+        returns.mean, returns.var = np.array(mean), np.array(variance)
     ppo.num_timesteps = int(state["steps"])
     # The seed alone would draw the same scenes again.
     ppo.set_random_seed((ppo.seed or 0) + ppo.num_timesteps)
