@@ -12,6 +12,7 @@ from active6d_perception.scene.belief_weights import BeliefWeights
 from active6d_perception.scene.fusion import FusionParameters
 from active6d_perception.scene.measured_view import MeasuredView
 from active6d_sim.rendering.pose_error import PoseError
+from active6d_tools.benchmark.camera_errors import error_panels, measure_errors, parse_errors
 from active6d_tools.benchmark.fusion_methods import MethodResults, compare_methods
 from active6d_tools.processed_scene import ProcessedView, disturb
 
@@ -46,6 +47,32 @@ def test_methods_fuse_the_same_views(tmp_path, monkeypatch):
         assert row["reported"] >= 3
         assert row["ms"] > 0
     assert results["ring"]["best-view"]["found"] >= 2 / 3
+
+
+@pytest.mark.slow
+def test_camera_errors_cost_accuracy_and_equal_ones_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("ACTIVE6D_SCENE_PATH", str(tmp_path))
+    mugs = three_mugs()
+    (tmp_path / "mug").mkdir()
+    make_scene(mugs.T_world_object, mugs.bin, "mug/val/0", 2).save(tmp_path / "mug" / "val_00.npz")
+    parameters = FusionParameters(confirmed=0.0)
+    rows = measure_errors(["mug/val/0"], parse_errors("0/0,8/0"), episodes=1, parameters=parameters)
+    assert [(row["millimetres"], row["variant"]) for row in rows] == [
+        (0, "aligned"), (0, "not aligned"), (8, "aligned"), (8, "not aligned")
+    ]  # fmt: skip
+    exact, unaligned = ({**row, "ms": 0, "variant": ""} for row in rows[:2])
+    assert exact == unaligned, "without errors, aligning changes nothing"
+    assert rows[3]["e_add_mm"] > 1.5 * rows[1]["e_add_mm"], "without alignment"
+    found, error, wrong = error_panels(rows)
+    np.testing.assert_array_equal(error.lines["aligned"], ([0, 8], [rows[0]["e_add_mm"], rows[2]["e_add_mm"]]))
+    assert set(found.lines) == set(wrong.lines) == {"aligned", "not aligned"}
+
+
+def test_errors_are_pairs_of_millimetres_and_degrees():
+    assert parse_errors("0/0, 5/0.5") == [PoseError(0, 0), PoseError(5, 0.5)]
+    for text in ("5", "5/a", "1/2/3", "", "5/-1", "inf/0", "nan/0"):
+        with pytest.raises(ValueError, match="--errors: "):
+            parse_errors(text)
 
 
 def test_a_wrong_camera_moves_what_is_in_the_world_and_nothing_in_its_frame():

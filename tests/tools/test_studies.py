@@ -27,7 +27,7 @@ def test_help_has_an_example_that_is_accepted(name, monkeypatch, capsys):
     shown = capsys.readouterr().out.partition("Example: ")[2].partition("\n\n")[0]
     assert shown.startswith(command)
 
-    def stop(*given):
+    def stop(*given, **options):
         raise Parsed(*given)
 
     for module in (study, arguments):

@@ -11,8 +11,7 @@ from active6d_core.registry import AUTOMATIC
 from active6d_perception.estimators.detection_rates import area_under_curve, calibration_error
 from active6d_perception.scene.fusion import FusionParameters, SceneFusion
 from active6d_perception.scene.joint_fusion import JointFusion
-from active6d_sim.rendering.pose_error import PoseError
-from active6d_tools.processed_scene import RING_VIEWS, ProcessedScene, ProcessedView, add_view, disturb
+from active6d_tools.processed_scene import RING_VIEWS, ProcessedScene, ProcessedView, add_view
 
 #: The views of an episode: six evenly on a ring at 45 degrees, six at random, or all of the grid.
 KINDS = ("ring", "random", "all")
@@ -73,7 +72,6 @@ def compare_methods(
     estimator: str = AUTOMATIC,
     seed: int = 0,
     parameters: FusionParameters | None = None,
-    pose_error: PoseError | None = None,
     on_progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> dict[str, dict[str, dict[str, float | None]]]:
     """Fuse the same views by every method.
@@ -85,14 +83,12 @@ def compare_methods(
         estimator: name of the deployed one.
         seed: of the views and of the sensor's noise.
         parameters: of the fusion.
-        pose_error: of the camera's poses; none when None. With errors, fusion of all views is also measured without
-            aligning the views, as "not aligned".
         on_progress: called with a scene's name, the number of scenes done and that of all.
 
     Returns:
         Kind to method to :meth:`MethodResults.summarise`.
     """
-    parameters, pose_error = parameters or FusionParameters(), pose_error or PoseError()
+    parameters = parameters or FusionParameters()
     results: dict[str, dict[str, MethodResults]] = {kind: {} for kind in kinds}
     for done, name in enumerate(names):
         on_progress(name, done, len(names))
@@ -101,23 +97,21 @@ def compare_methods(
             "best-view": SceneFusion(processed.model, parameters),
             "all-views": JointFusion(processed.model, parameters),
         }
-        if pose_error != PoseError():
-            methods["not aligned"] = JointFusion(processed.model, parameters, align=False)
         rng = np.random.default_rng([seed + 1, int(name.split("/")[-1])])
-        for kind, exact in _draw_episodes(processed, kinds, episodes, rng):
-            views = [disturb(view, pose_error, rng) for view in exact]
+        for kind, views in draw_episodes(processed, kinds, episodes, rng):
             for method, fusion in methods.items():
                 result = results[kind].setdefault(method, MethodResults(processed.model.diameter))
-                _fuse(fusion, views, result, processed)
+                fuse_episode(fusion, views, result, processed)
     return {
         kind: {method: result.summarise(parameters.confirmed) for method, result in own.items()}
         for kind, own in results.items()
     }
 
 
-def _draw_episodes(
+def draw_episodes(
     processed: ProcessedScene, kinds: Sequence[str], episodes: int, rng: np.random.Generator
 ) -> Iterator[tuple[str, list[ProcessedView]]]:
+    """The views of ``episodes`` episodes of each kind in a scene, with their kind; one of all views."""
     for kind in kinds:
         for _ in range(1 if kind == "all" else episodes):
             drawn: Iterable[int] = range(len(processed.sphere))
@@ -126,12 +120,13 @@ def _draw_episodes(
             yield kind, [processed.view(index) for index in drawn]
 
 
-def _fuse(
+def fuse_episode(
     fusion: JointFusion | SceneFusion,
     views: Sequence[ProcessedView],
     result: MethodResults,
     processed: ProcessedScene,
 ) -> None:
+    """Fuse the views of one episode of a scene from the beginning, and add what came of it to ``result``."""
     fusion.reset()
     few = len(views) <= RING_VIEWS
     for view in views:

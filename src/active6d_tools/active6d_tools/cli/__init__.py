@@ -16,6 +16,7 @@ from active6d_tools.cli import (
     bank,
     benchmark,
     benchmark_arm,
+    benchmark_camera_errors,
     benchmark_estimator,
     benchmark_fusion,
     doctor,
@@ -134,6 +135,7 @@ for command in scenes.app.registered_commands:
     command.cls = PartsCommand
 app.add_typer(scenes.app, name="scenes")
 benchmark.app.command(cls=PartsCommand)(benchmark_arm.arm)
+benchmark.app.command(cls=PartsCommand)(benchmark_camera_errors.camera_errors)
 benchmark.app.command(cls=PartsCommand)(benchmark_estimator.estimator)
 benchmark.app.command(cls=PartsCommand)(benchmark_fusion.fusion)
 benchmark.app.command(cls=PartsCommand)(benchmark.pipeline)

@@ -35,12 +35,6 @@ def fusion(
     confirmed: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Least probability of the objects that count.")
     ] = 0.5,
-    pose_error_mm: Annotated[
-        float, typer.Option(min=0.0, help="Shift of the camera's poses, root mean square in millimetres.")
-    ] = 0.0,
-    pose_error_degrees: Annotated[
-        float, typer.Option(min=0.0, help="Rotation of the camera's poses, root mean square in degrees.")
-    ] = 0.0,
     estimator: Annotated[str, typer.Option(help="Estimator for each view: auto, {estimators}.")] = "auto",
     seed: Seed = 0,
     json_file: JsonFile = None,
@@ -51,7 +45,6 @@ def fusion(
     """
     from active6d_core.object_model import load_object
     from active6d_perception.scene.fusion import FusionParameters
-    from active6d_sim.rendering.pose_error import PoseError
     from active6d_sim.scenes.scene_store import SPLITS, load_scene
     from active6d_tools.benchmark.fusion_methods import KINDS, compare_methods
 
@@ -67,7 +60,6 @@ def fusion(
             names,
             **settings,
             parameters=FusionParameters(confirmed=confirmed),
-            pose_error=PoseError(pose_error_mm, pose_error_degrees),
             on_progress=on_progress,
         )
     for kind, methods in results.items():
@@ -80,7 +72,6 @@ def fusion(
         "confirmed": confirmed,
         **settings,
     }
-    report |= {"pose_error_mm": pose_error_mm, "pose_error_degrees": pose_error_degrees}
     write_json(json_file, {**report, "results": results})
 
 

@@ -54,12 +54,13 @@ class Job:
 #: Key of a report by which it is known whether its figure exists.
 _DRAWN = "is_drawn"
 
-_THIRTY = f"random,max-distance,unidirectional,entropy,lowest-score,information-gain,{PAPERS},{DEFAULT}"
+_MANY = f"random,max-distance,unidirectional,entropy,lowest-score,information-gain,{PAPERS},{DEFAULT}"
 JOBS = {
     job.name: job
     for job in (
         Job("evaluate", "evaluate --policies all --steps 5"),
-        Job("evaluate_thirty", f"evaluate --policies {_THIRTY} --steps 5 --sample 1200 --banks thirty", trains=True),
+        Job("evaluate_thirty", f"evaluate --policies {_MANY} --steps 5 --sample 1200 --banks banks", trains=True),
+        Job("evaluate_wild", f"evaluate --policies {_MANY} --steps 5 --split wild_test --banks banks", trains=True),
         Job("evaluate_ten", "evaluate --policies random --steps 10"),
         Job(
             "steps",
@@ -73,6 +74,7 @@ JOBS = {
             draws=True,
         ),
         Job("fusion-methods", "benchmark fusion --split test --episodes 4"),
+        Job("camera-errors", "benchmark camera-errors --split test", draws=True),
         Job("fusion", "ablate fusion --policies random --sample 1000"),
         Job("verification", "ablate verification --policies random --sample 1000"),
         Job("alpha", "ablate alpha --sample 1000", draws=True, trains=True),
@@ -177,11 +179,14 @@ BLOCKS: dict[str, Callable[[Mapping[str, Measured]], str]] = {
     "paper differences": lambda measured: _each(_against(PAPERS))(_of_job("evaluate", measured)),
     "evaluate thirty": _block("evaluate_thirty", _each(tables.policies_table)),
     "thirty differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate_thirty", measured)),
+    "evaluate wild": _block("evaluate_wild", _each(tables.policies_table)),
+    "wild differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate_wild", measured)),
     "evaluate ten": _block("evaluate_ten", _each(tables.policies_table)),
     "steps": _block("steps", tables.steps_tables),
     "planning": _block("planning", _variants("detection_rate", "e_add_mm", "distance_m", "moves")),
     "noise-resampling": _block("noise-resampling", tables.noise_resampling_table),
     "fusion-methods": _block("fusion-methods", tables.fusion_methods_table),
+    "camera-errors": _block("camera-errors", tables.camera_errors_table),
     "fusion": _block("fusion", _variants(*_FUSED)),
     "verification": _block("verification", _variants(*_FUSED)),
     "alpha": _block("alpha", _variants(*_PAPERS_MEASURES)),

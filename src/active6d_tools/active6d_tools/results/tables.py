@@ -141,6 +141,22 @@ def fusion_methods_table(reports: Reports) -> str:
     return table(["", "views", "method", *(text for text, _ in columns.values())], rows)
 
 
+def camera_errors_table(reports: Reports) -> str:
+    """Errors of the camera as rows, objects as columns: found, error and wrong, without and with aligned views."""
+
+    def cell(report: dict[str, Any], error: str) -> str:
+        own = {row["variant"]: row for row in report["rows"] if _camera_error(row) == error}
+        ends = own["not aligned"], own["aligned"]
+        parts = []
+        for key, digits, unit in (("found", 3, ""), ("e_add_mm", 1, " mm"), ("wrong", 3, " wrong")):
+            pair = ("-" if row[key] is None else number(row[key], digits) for row in ends)
+            parts.append(f"{' → '.join(pair)}{unit}")
+        return ", ".join(parts)
+
+    errors = list(dict.fromkeys(_camera_error(row) for report in reports.values() for row in report["rows"]))
+    return table(["", *reports], [[error, *(cell(report, error) for report in reports.values())] for error in errors])
+
+
 def seeds_table(reports: Reports) -> str:
     """Every training: detection rate, error, validation result, minutes, and whether it is shipped."""
 
@@ -152,6 +168,10 @@ def seeds_table(reports: Reports) -> str:
         return ", ".join(filter(None, (found, on_validation, f"{row['training_minutes']:.0f} min", ships)))
 
     return _pivot(reports, lambda row: row["variant"], render)
+
+
+def _camera_error(row: dict[str, Any]) -> str:
+    return f"{row['millimetres']:g} mm, {row['degrees']:g} degrees"
 
 
 def steps_tables(reports: Reports) -> str:
