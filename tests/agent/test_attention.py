@@ -18,7 +18,8 @@ from active6d_agent.policies.attention.network import (
     load_network,
     save_network,
 )
-from active6d_agent.policies.attention.ppo import BankVecEnv, PaperPolicy, PpoParameters, train_ppo, validate
+from active6d_agent.policies.attention.ppo import BankVecEnv, PpoParameters, train_ppo, validate
+from active6d_agent.policies.attention.ppo_policy import PaperPolicy
 from active6d_agent.policies.registry import Observation, create_policy
 
 

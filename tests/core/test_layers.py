@@ -29,6 +29,7 @@ TRAINING = {
     "active6d_agent.environment.throughput",
     "active6d_agent.evaluation.ablations",
     "active6d_agent.policies.attention.ppo",
+    "active6d_agent.policies.attention.ppo_policy",
     "active6d_agent.policies.sb3",
 }
 #: Registers the environment where Gymnasium is installed, and must import where it is not.
