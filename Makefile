@@ -26,8 +26,8 @@ results: setup  ## what docs/results.md shows and is not measured yet, except tr
 test: setup  ## all tests
 	$(BIN)/python -m pytest tests -n 2 --dist loadfile
 
-battery: setup  ## attacks on stamps, messages, bags and views for 20 minutes
-	$(BIN)/python tests/battery.py --seconds 1200
+battery: setup  ## attacks on messages, files, graphs, processes and commands for 20 minutes
+	$(BIN)/python tests/battery --seconds 1200
 
 check: lint  ## what needs no run: lint, format, types, layers, links of the documentation
 	$(BIN)/mypy

@@ -114,12 +114,13 @@ class StubEstimator:
     def estimate(self, view: View) -> Hypotheses:
         """A function of the view alone."""
         rows, columns = np.indices(view.depth.shape)
-        quarter = 1 + 2 * (rows >= CAMERA.height // 2) + (columns >= CAMERA.width // 2)
+        quarter = 1 + 2 * (rows >= rows.shape[0] // 2) + (columns >= rows.shape[1] // 2)
         segmentation = np.where(view.depth < 0.75, quarter, 0).astype(np.uint16)
-        depth = np.array([view.depth[segmentation == label].mean() for label in range(1, 5)]) + self._offset
+        labels = np.unique(segmentation[segmentation > 0])
+        depth = np.array([view.depth[segmentation == label].mean() for label in labels]) + self._offset
         directions = np.array([[-0.2, -0.15, 1], [0.2, -0.15, 1], [-0.2, 0.15, 1], [0.2, 0.15, 1]])
-        T = make_transform(np.broadcast_to(np.eye(3), (4, 3, 3)), directions * depth[:, None])
-        return Hypotheses.from_masks(T, np.full(4, 0.5), np.arange(1, 5), segmentation, view.depth)
+        T = make_transform(np.broadcast_to(np.eye(3), (len(labels), 3, 3)), directions[labels - 1] * depth[:, None])
+        return Hypotheses.from_masks(T, np.full(len(labels), 0.5), labels, segmentation, view.depth)
 
 
 if "stub" not in list_estimators():

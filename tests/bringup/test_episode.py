@@ -1,7 +1,9 @@
 """An episode in one process, with a stub in place of camera and estimator: order, endings, failures, the result."""
 
+import gc
 import os
 import signal
+import weakref
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from ros_harness import fresh_domain
 from active6d_bringup.bags.reader import read_episode
 from active6d_bringup.bags.replay import ReplaySettings, replay
 from active6d_bringup.bags.writer import TYPESTORE, RecordingError
+from active6d_bringup.graph import composition
 from active6d_bringup.graph.composition import GraphDescription
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, EpisodeSettings, describe, run_episode
 from active6d_core.ros.episode_messages import GoalStatus
@@ -228,3 +231,26 @@ def test_starting_order_puts_listeners_first():
     assert order == ["episode_recorder", "attention_policy", "hypothesis_fusion", "pose_estimator", "camera_simulator"]
     with pytest.raises(ValueError, match="unknown node 'camera'"):
         GraphDescription({"camera": {}})
+
+
+def test_nodes_are_gone_when_their_episode_has_ended(monkeypatch):
+    nodes = []
+    monkeypatch.setattr(
+        composition, "load_node_type", lambda name, load=composition.load_node_type: watched(load(name), nodes)
+    )
+    gc.disable()
+    try:
+        run_episode(settings())
+        assert len(nodes) == 4
+        assert [node() for node in nodes if node() is not None] == []
+    finally:
+        gc.enable()
+
+
+def watched(node_type, nodes):
+    def make(*arguments, **options):
+        node = node_type(*arguments, **options)
+        nodes.append(weakref.ref(node))
+        return node
+
+    return make

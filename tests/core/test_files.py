@@ -1,10 +1,11 @@
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
 from active6d_core.array_archive import read_archive, read_array
-from active6d_core.files import Checkpoints, atomic_file, cache_folder, make_folder, sha256_of, write_file
+from active6d_core.files import Checkpoints, append_line, atomic_file, cache_folder, make_folder, sha256_of, write_file
 from active6d_core.images import read_color, read_depth
 from active6d_core.structured_text import read_json, read_yaml
 
@@ -83,3 +84,23 @@ def test_a_checkpoint_is_due_when_its_time_has_passed(monkeypatch):
     now = 121.0
     assert checkpoints.due()
     assert not checkpoints.due()
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), RuntimeError(f"I/O: {os.strerror(errno.ENOSPC)}")]
+)
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, error):
+    path = tmp_path / "weights"
+
+    def write():
+        with atomic_file(path):
+            raise error
+
+    with pytest.raises(OSError, match=f"{path} cannot be written .No space left on device.; free some space, or"):
+        write()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_line_that_finds_no_room_names_the_file():
+    with pytest.raises(OSError, match="/dev/full cannot be written"):
+        append_line(Path("/dev/full"), "text")

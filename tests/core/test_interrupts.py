@@ -108,6 +108,15 @@ def test_ctrl_c_that_a_library_catches_or_that_comes_at_the_end_is_exit_code_130
     assert (ended.returncode, ended.stderr) == (130, "active6d: interrupted\n")
 
 
+def test_few_threads_are_one_line_before_a_library_needs_them():
+    few = "import threading\nbegin, count = threading.Thread.start, iter(range(9))\ndef start(thread):\n    "
+    few += "if next(count) == 7:\n        raise RuntimeError\n    begin(thread)\nthreading.Thread.start = start\n"
+    script = few + "from active6d_tools import command\ncommand.main()"
+    ended = subprocess.run([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True)
+    words = "active6d: only 7 threads can be started, 32 are needed; raise the limit of processes (ulimit -u), or end"
+    assert (ended.returncode, ended.stderr) == (1, f"{words} other programs\n")
+
+
 def modules(process):
     """A word that says that the command's own handler is in place: it ignores neither signal by default."""
     with open(f"/proc/{process}/status") as file:

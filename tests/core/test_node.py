@@ -340,7 +340,11 @@ class Ended(DepthNode):
         # The context ends and nobody wakes the executor, as when rclpy's wake comes before the end.
         threading.Timer(0.5, lambda: rclpy.get_default_context().handle.shutdown()).start()
 
-kind = {"defect": Defective, "end": Ended}.get(sys.argv[1], DepthNode)
+class Refused(DepthNode):
+    def __init__(self):
+        raise RuntimeError("pthread_create failed: Resource temporarily unavailable")
+
+kind = {"refused": Refused, "defect": Defective, "end": Ended}.get(sys.argv[1], DepthNode)
 runner.run_node(kind, sys.argv[:1] + sys.argv[2:])
 """
 
@@ -365,6 +369,13 @@ def test_exit_code_two_is_for_parameters_and_a_defect_shows_its_traceback(argume
     assert ended.returncode == code
     assert text in ended.stderr
     assert ("Traceback" in ended.stderr) == (code == 1)
+
+
+def test_a_node_that_the_system_refuses_is_one_line():
+    ended = run_a_node("refused")
+    reason = "pthread_create failed: Resource temporarily unavailable"
+    assert (ended.returncode, ended.stderr) == (1, f"error: the node cannot be created: {reason}\n")
+    assert "Traceback" in run_a_node("refused", ACTIVE6D_TRACEBACK="1").stderr
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.compiled import compiled
 from active6d_perception.model import model_views
 from active6d_perception.scene import (
     body_refinement,
@@ -135,3 +136,15 @@ def test_what_is_not_a_number_is_nowhere():
     mask = np.ones(depth.shape, np.uint16)
     lost = Hypotheses(nowhere, np.ones(2), np.full((2, 4), np.nan), np.ones(2), np.ones(2, np.uint16), mask)
     assert not verification.Verifier(model).score(depth, PinholeCamera(8, 8, 8.0, 8.0, 3.5, 3.5), lost).any()
+
+
+def test_without_a_folder_for_the_cache_code_is_compiled_without(monkeypatch):
+    original = numba.njit
+
+    def njit(*, cache=False, **options):
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return original(**options)
+
+    monkeypatch.setattr(numba, "njit", njit)
+    assert compiled(lambda number: number + 1)(2) == 3

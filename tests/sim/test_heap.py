@@ -1,5 +1,8 @@
 """Heaps: reproducible, at rest, in the bin, and no object in another."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -8,7 +11,7 @@ import trimesh
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, is_rigid, transform_points
 from active6d_sim.physics import heap
-from active6d_sim.physics.bullet import connect
+from active6d_sim.physics.bullet import connect, decompose
 from active6d_sim.scenes.scene import Bin, Scene
 
 
@@ -149,3 +152,21 @@ def test_pickled_scene_is_refused(tmp_path):
 def test_impossible_bins_are_refused(sizes):
     with pytest.raises(ValueError, match="bin sizes"):
         Bin(*sizes)
+
+
+def test_convex_parts_are_made_without_pythons_lock(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    model, longest, began = load_object("coffee_cup"), 0.0, time.monotonic()
+    with ThreadPoolExecutor(1) as pool:
+        made = pool.submit(heap.collision_file, model)
+        while not made.done():
+            last = time.monotonic()
+            time.sleep(0.001)
+            longest = max(longest, time.monotonic() - last)
+    assert made.result().is_file()
+    assert longest < (time.monotonic() - began) / 4, "Ctrl-C would have waited for as long"
+
+
+def test_convex_parts_that_cannot_be_made_are_named(tmp_path):
+    with pytest.raises(OSError, match=r"parts\.obj was not made from .*none\.obj"):
+        decompose(str(tmp_path / "none.obj"), str(tmp_path / "parts.obj"), str(tmp_path / "log"))

@@ -1,5 +1,6 @@
 """Files that several packages deal with: the cache folder, checksums, and writing a file in one step."""
 
+import errno
 import hashlib
 import os
 import time
@@ -8,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+#: What the system says when there is no room: the disk, the quota, the limit of a file's size.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 #: Long work is written to a file at least this often, so that an interruption loses less than 30 s.
 CHECKPOINT_SECONDS = 20.0
 
@@ -86,8 +89,42 @@ def atomic_file(path: Path) -> Iterator[Path]:
         raise _no_folder(path.parent, error) from error
     with temporary as folder:
         unfinished = Path(folder) / path.name
-        yield unfinished
+        with naming(path):
+            yield unfinished
         os.replace(unfinished, path)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Name ``path`` in the error of what is written in the block when there is no room: the system does not.
+
+    Raises:
+        OSError: there is no room; the message says what to do.
+    """
+    try:
+        yield
+    except Exception as error:
+        if reason := _full(error):
+            message = f"{path} cannot be written ({reason}); free some space, or choose another folder"
+            raise OSError(message) from error
+        raise
+
+
+def append_line(path: Path, line: str) -> None:
+    """Write one more line, which is on disk before this returns.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with naming(path), path.open("a") as file:
+        file.write(f"{line}\n")
+
+
+def _full(error: Exception) -> str:
+    """The system's words if an error means that there is no room, else nothing. Some libraries keep only its words."""
+    if isinstance(error, OSError):
+        return os.strerror(error.errno) if error.errno in _FULL else ""
+    return next((os.strerror(number) for number in _FULL if os.strerror(number) in str(error)), "")
 
 
 def write_file(path: Path, content: str | bytes) -> None:

@@ -1,5 +1,6 @@
 """Which nodes make the graph, and how they run together in one process on one executor."""
 
+import gc
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -175,6 +176,8 @@ class ComposedGraph:
         self.executor.shutdown()
         self.context.try_shutdown()
         self._description.release_domain()
+        self._guests.clear()
+        self.nodes.clear()
 
 
 def load_node_type(name: str) -> type[Node]:
@@ -206,6 +209,9 @@ def running(graph: Graph) -> Iterator[Graph]:
         yield graph
     finally:
         graph.close()
+        # Nodes and their callbacks refer to each other. Python would collect them after hundreds of graphs, because it
+        # counts objects, of which an image is one.
+        gc.collect()
 
 
 def default_params_file() -> Path | None:

@@ -1,5 +1,6 @@
 """The main function of every node's executable."""
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -30,7 +31,7 @@ def run_node(node_type: Callable[[], GraphNode], args: Sequence[str] | None = No
     node = None
     try:
         try:
-            node = node_type()
+            node = _create(node_type)
             node.get_logger().info(f"domain {node.context.get_domain_id()}, can be reached {describe_reach()}")
             if node.value("autostart"):
                 node.start()
@@ -55,6 +56,17 @@ def run_node(node_type: Callable[[], GraphNode], args: Sequence[str] | None = No
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _create(node_type: Callable[[], GraphNode]) -> GraphNode:
+    """The node; one line and exit code 1 where the system refuses threads, files or memory to the middleware."""
+    try:
+        return node_type()
+    except (RuntimeError, MemoryError) as error:
+        if os.environ.get("ACTIVE6D_TRACEBACK"):
+            raise
+        print(f"error: the node cannot be created: {error or type(error).__name__}", file=sys.stderr)
+        sys.exit(1)
 
 
 def _refuse(text: str) -> NoReturn:

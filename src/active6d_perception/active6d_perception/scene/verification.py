@@ -91,7 +91,8 @@ class Verifier:
         direction = self.views.nearest_direction(T_camera_object)[owner]
         distance, p = self.views.nearest_visible(q, direction, self.epsilon + self.views.spacing)
         surface = self.views.points, self.views.normals, self.views.spacing
-        return local_fit(*_against_discs(q, n_q, distance, p, surface), self.epsilon)
+        distance, agreement = _against_discs(q, n_q, distance, p, surface)
+        return local_fit(distance, agreement, self.epsilon)
 
     def mask_pixels(self, depth: np.ndarray, hypotheses: Hypotheses) -> tuple[np.ndarray, np.ndarray]:
         """Pixels with depth inside the masks, at most ``samples`` of each, evenly spaced in raster order.

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from active6d_core.camera import PinholeCamera, View
-from active6d_core.files import make_folder
+from active6d_core.files import make_folder, naming, write_file
 from active6d_core.images import read_color, read_depth
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform, transform_from_quaternion
 from active6d_core.structured_text import read_json
@@ -167,10 +167,10 @@ def write_bop_scene(
         make_folder(folder / kind)
     cameras, truth = {}, {}
     for image, view in enumerate(views):
-        Image.fromarray(view.color).save(folder / "rgb" / f"{image:06d}.png")
+        _write_image(folder / "rgb" / f"{image:06d}.png", view.color)
         steps = np.rint(np.nan_to_num(view.depth.astype(float), nan=0.0, posinf=0.0) * (1e3 / depth_scale))
         steps = np.where(steps <= _DEEPEST, steps, 0).astype(np.uint16)
-        Image.fromarray(steps).save(folder / "depth" / f"{image:06d}.png")
+        _write_image(folder / "depth" / f"{image:06d}.png", steps)
         T_camera_world = invert(view.T_world_camera)
         cameras[image] = {
             "cam_K": view.camera.matrix.ravel().tolist(),
@@ -193,10 +193,15 @@ def _pose_entry(T: np.ndarray, rotation: str, translation: str) -> dict[str, lis
     return {rotation: T[:3, :3].ravel().tolist(), translation: (1e3 * T[:3, 3]).tolist()}
 
 
+def _write_image(path: Path, pixels: np.ndarray) -> None:
+    with naming(path):
+        Image.fromarray(pixels).save(path)
+
+
 def _write_by_image(path: Path, entries: dict[int, Any]) -> None:
     """Write one line per image, as BOP's tools do."""
     lines = ",\n".join(f'  "{image}": {json.dumps(entry)}' for image, entry in entries.items())
-    path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+    write_file(path, f"{{\n{lines}\n}}\n")
 
 
 def _read_by_image(path: Path) -> dict[int, Any]:

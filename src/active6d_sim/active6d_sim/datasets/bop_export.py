@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
-from active6d_core.files import make_folder
+from active6d_core.files import make_folder, write_file
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.datasets.bop import CAMERA_FILE, write_bop_scene
@@ -94,7 +94,7 @@ def write_model(folder: Path, model: ObjectModel, object_id: int = 1) -> None:
         ]
     path = folder / "models_info.json"
     known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    path.write_text(json.dumps({**known, str(object_id): info}, indent=2) + "\n", encoding="utf-8")
+    write_file(path, json.dumps({**known, str(object_id): info}, indent=2) + "\n")
 
 
 def _about(rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:

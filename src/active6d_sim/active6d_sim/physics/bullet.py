@@ -2,10 +2,16 @@
 
 import ctypes
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 __all__ = ["BulletClient", "connect", "decompose", "pybullet", "silence"]
+_DECOMPOSE = (
+    "import pybullet, sys; pybullet.vhacd(*sys.argv[1:], resolution=400_000, concavity=0.001, maxNumVerticesPerCH=48)"
+)
 _LIBC = ctypes.CDLL(None)
 
 
@@ -38,6 +44,15 @@ def connect() -> BulletClient:
 
 
 def decompose(source: str, parts: str, log: str) -> None:
-    """Write the convex parts (V-HACD) of the ``.obj`` file ``source`` to the file ``parts``, one group per part."""
-    with silence(1):
-        pybullet.vhacd(source, parts, log, resolution=400_000, concavity=0.001, maxNumVerticesPerCH=48)
+    """Write the convex parts (V-HACD) of the ``.obj`` file ``source`` to the file ``parts``, one group per part.
+
+    In a process of its own: the library keeps Python's lock for seconds, and Ctrl-C would wait for it.
+
+    Raises:
+        OSError: the parts were not made.
+    """
+    command = [sys.executable, "-c", _DECOMPOSE, source, parts, log]
+    ended = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    if ended.returncode != 0 or not Path(parts).is_file():  # the library does not say what it could not write
+        said = " ".join(ended.stderr.splitlines()[-1:])
+        raise OSError(f"{parts} was not made from {source} (exit code {ended.returncode}) {said}".strip())

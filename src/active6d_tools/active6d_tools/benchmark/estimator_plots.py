@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from active6d_core.files import atomic_file
 from active6d_core.metrics import MISSED_E_ADD
 from active6d_core.object_model import ObjectModel
 from active6d_perception.estimators.single_view_evaluation import EstimatorResult
@@ -105,5 +106,5 @@ def _finish(axes: Any) -> None:
 
 def _save(figure: Any, path: Path, title: str) -> None:
     figure.suptitle(title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    with atomic_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=110)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from active6d_core.files import append_line, write_file
 from active6d_perception.estimators.single_view_evaluation import ViewResult
 
 _INTEGERS = {"hypothesis", "object"}
@@ -33,8 +34,7 @@ class Records:
         if path.is_file():
             self._read(path, header)
         else:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(header) + "\n")
+            write_file(path, json.dumps(header) + "\n")
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._results
@@ -50,8 +50,7 @@ class Records:
                 name: np.round(value, 7).tolist() if isinstance(value, np.ndarray) else value
                 for name, value in asdict(result).items()
             }
-            with self._path.open("a") as file:
-                file.write(json.dumps({"key": key, **entry}) + "\n")
+            append_line(self._path, json.dumps({"key": key, **entry}))
 
     def _read(self, path: Path, header: dict[str, Any]) -> None:
         text = path.read_text()
@@ -67,7 +66,7 @@ class Records:
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: cannot continue with these records ({error})") from error
         if whole != text:  # the last line is incomplete: writing was interrupted
-            path.write_text(whole)
+            write_file(path, whole)
 
 
 def _result(entry: dict[str, Any]) -> ViewResult:

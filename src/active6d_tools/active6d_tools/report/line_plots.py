@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from active6d_core.files import atomic_file
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -33,7 +35,6 @@ def draw_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
     """
     from matplotlib.figure import Figure  # slow to import
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(5.4 * len(panels), 4.0), layout="constrained")
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         for label, (x, y, *interval) in panel.lines.items():
@@ -49,4 +50,5 @@ def draw_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
         if len(panel.lines) + len(panel.levels) > 1:
             axes.legend(fontsize="small")
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    with atomic_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=110)

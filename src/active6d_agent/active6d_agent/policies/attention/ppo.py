@@ -27,7 +27,7 @@ from active6d_agent.policies.attention.network import (
 )
 from active6d_agent.policies.attention.ppo_policy import PaperPolicy
 from active6d_agent.policies.registry import Observation
-from active6d_core.files import Checkpoints, atomic_file, make_folder, write_file
+from active6d_core.files import Checkpoints, append_line, atomic_file, make_folder, write_file
 
 #: The paper's length of the training and its learning rate (supplement E); batch and discount are the usual ones here.
 AS_IN_THE_PAPER = {"total": 10_000_000, "learning_rate": 1e-4}
@@ -210,8 +210,7 @@ def train_ppo(
         returns = [episode["r"] for episode in ppo.ep_info_buffer or []]
         mean_return = float(np.mean(returns)) if returns else float("nan")
         progress = Progress(ppo.num_timesteps, time.perf_counter() - begun, *measured, mean_return)
-        with curve.open("a") as file:
-            file.write(json.dumps(asdict(progress)) + "\n")
+        append_line(curve, json.dumps(asdict(progress)))
         if (progress.detection_rate, -progress.e_add_mm) > best:
             best = (progress.detection_rate, -progress.e_add_mm)
             save_network(network, folder / "best.safetensors", {**identity, "validation": asdict(progress)})

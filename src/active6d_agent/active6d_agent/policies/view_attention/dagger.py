@@ -32,7 +32,7 @@ from active6d_agent.policies.view_attention.network import (
     save_network,
     value_views,
 )
-from active6d_core.files import Checkpoints, make_folder
+from active6d_core.files import Checkpoints, append_line, make_folder
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 
@@ -207,8 +207,7 @@ def train_dagger(
             continue
         measured = validate(learner.network, validation, starts, parameters.steps)
         progress = DaggerProgress(learner.round, seconds, learner.states, loss, *measured)
-        with curve.open("a") as file:
-            file.write(json.dumps(asdict(progress)) + "\n")
+        append_line(curve, json.dumps(asdict(progress)))
         made = {**common, "progress": asdict(progress)}
         if (progress.detection_rate, -progress.e_add_mm) > best:
             best = (progress.detection_rate, -progress.e_add_mm)

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from active6d_core.files import atomic_file
+
 _RATES = {
     "add_half": "ADD, half visible",
     "add_tenth": "ADD, a tenth visible",
@@ -45,4 +47,5 @@ def draw_curves(history: Sequence[dict[str, float]], path: Path, title: str) -> 
         axes.grid(alpha=0.3)
     below.supxlabel("step (losses: training solid, validation dashed)", fontsize="medium")
     figure.suptitle(title)
-    figure.savefig(path, dpi=100)
+    with atomic_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=100)

@@ -1,6 +1,6 @@
 """Hostile files for the reliability battery: random ones, each with the reader that must refuse or read it.
 
-    echo 7 | python tests/hostile_files.py
+    echo 7 | python tests/battery/hostile_files.py
 
 reads the file of seed 7 in a process of its own and prints what went wrong: a hang, a traceback, too much memory.
 """
@@ -97,7 +97,7 @@ def _description(rng: np.random.Generator, folder: Path) -> tuple[str, Path]:
 
 def _archive(rng: np.random.Generator, folder: Path) -> tuple[str, Path]:
     reader = str(rng.choice(["bank", "scene"]))
-    root = Path(__file__).parents[1] / "src"
+    root = Path(__file__).parents[2] / "src"
     name = "active6d_agent/active6d_agent/bank/shipped/mug_test.npz"
     with np.load(root / name) as stored:
         data = dict(stored) if reader == "bank" else {"T_world_object": stored["T_world_object"], "seed": np.array(1)}
@@ -127,7 +127,7 @@ def _archive(rng: np.random.Generator, folder: Path) -> tuple[str, Path]:
 
 
 def _weights(rng: np.random.Generator, folder: Path) -> tuple[str, Path]:
-    root = Path(__file__).parents[1] / "src"
+    root = Path(__file__).parents[2] / "src"
     places = {
         "network": "active6d_perception/active6d_perception/estimators/dense/weights/mug.safetensors",
         "policy": "active6d_agent/active6d_agent/policies/weights/view-attention_mug.safetensors",
