@@ -29,7 +29,9 @@ def test_a_built_in_part_is_imported_when_asked_for(makers):
 
 
 def test_refusals_name_the_part(makers):
-    def refuse(model, size):
+    def refuse(model, size, scale=1.0, flat=False, words=""):
+        if not size:
+            raise TypeError("needs more")
         raise ValueError(f"size {size} is none")
 
     assert makers.register("strict")(refuse) is refuse
@@ -38,8 +40,13 @@ def test_refusals_name_the_part(makers):
         makers.register("strict")(lambda model: None)
     for parameters, message in (
         ({"size": 7}, "maker 'strict': size 7 is none"),
+        ({"size": 7, "scale": "x"}, "maker 'strict': parameter 'scale' must be a number such as 1.0, got 'x'"),
+        ({"size": 7, "scale": True}, "maker 'strict': parameter 'scale' must be a number such as 1.0, got True"),
+        ({"size": 7, "flat": 1}, "maker 'strict': parameter 'flat' must be a truth value such as False, got 1"),
+        ({"size": "x", "words": 3}, "maker 'strict': parameter 'words' must be a text such as '', got 3"),
+        ({"size": []}, r"maker 'strict': needs more; size is \[\]"),
         ({}, "maker 'strict' needs the parameter 'size'; give it with --set"),
-        ({"speed": 1}, "maker 'strict' has no parameter 'speed'; it has: size"),
+        ({"speed": 1}, "maker 'strict' has no parameter 'speed'; it has: size, scale, flat, words"),
     ):
         with pytest.raises(ValueError, match=message):
             makers.create("strict", load_object("mug"), **parameters)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from numbers import Real
 from typing import Any, Generic, TypeVar
 
 from active6d_core.nearest_name import did_you_mean
@@ -112,10 +113,17 @@ class Registry(Generic[_Part]):
                 f"{self._kind} '{name}' needs the parameter '{needed[0]}'; give it with --set, such as "
                 f"{name}.{needed[0]}=VALUE, or for a node in {self._kind}_parameters"
             )
+        for parameter, value in parameters.items():
+            default = inspect.signature(factory).parameters[parameter].default
+            if not _is_like(value, default):
+                such = f"a {_KINDS[type(default)][0]} such as {default!r}"
+                raise ValueError(f"{self._kind} '{name}': parameter '{parameter}' must be {such}, got {value!r:.60}")
         try:
             return factory(model, **parameters)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{self._kind} '{name}': {error}") from error
+            named = any(parameter in str(error) for parameter in parameters)
+            given = "" if named else "".join(f"; {key} is {value!r:.60}" for key, value in parameters.items())
+            raise ValueError(f"{self._kind} '{name}': {error}{given}") from error
 
     def _factory(self, name: str) -> Callable[..., _Part]:
         if name not in self._factories and name in self._built_in:
@@ -161,6 +169,22 @@ class Registry(Generic[_Part]):
                 )
             found[entry_point.name] = entry_point
         return found
+
+
+#: What a user calls the types of defaults, and what may stand for each of them.
+_KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
+    bool: ("truth value", (bool,)),
+    int: ("number", (Real,)),
+    float: ("number", (Real,)),
+    str: ("text", (str, os.PathLike)),
+}
+
+
+def _is_like(value: object, default: object) -> bool:
+    """Whether a value may stand for a default: of its kind, as far as the default is of a simple one."""
+    if type(default) not in _KINDS:
+        return True
+    return isinstance(value, _KINDS[type(default)][1]) and isinstance(value, bool) == isinstance(default, bool)
 
 
 def request_imports(modules: Iterable[str]) -> None:
