@@ -116,6 +116,23 @@ def test_the_reward_is_equation_4(lookup, as_printed):
         assert given_reward == pytest.approx(expected, abs=1e-4)
 
 
+def test_every_object_can_be_rewarded(lookup):
+    """Equation 2 of the sum over all objects, whatever is attended."""
+    reward = RewardParameters(alpha=0.0, motion_scale=0.0, every_object=True)
+    env, model, truth = Active6DEnv(lookup, reward=reward), lookup.model, lookup.bank.scenes[0].T_world_object
+    views = [env.reset(seed=1, options={"scene": 0, "view": 31})[1]["view"]]
+    rng = np.random.default_rng(5)
+    for _ in range(5):
+        before = lookup.objects(0, views)
+        _, given_reward, _, _, info = env.step(np.array([*rng.uniform(-1, 1, 2), rng.integers(MAX_OBJECTS)]))
+        views.append(info["view"])
+        sums = [
+            np.minimum(e_add(model, T[:, None], truth, cutoff=0.05), 0.05).min(axis=0).sum()
+            for T in (before.T_world_object, lookup.objects(0, views).T_world_object)
+        ]
+        assert given_reward == pytest.approx((sums[0] - sums[1]) / (0.1 * model.diameter), abs=1e-4)
+
+
 def test_attending_to_nothing_is_paid_for_motion_only(lookup):
     env = Active6DEnv(lookup, reward=RewardParameters(0.5, 0.5, motion_scale=1.0))
     views = [env.reset(seed=2)[1]["view"]]

@@ -25,6 +25,7 @@ class RewardParameters:
         distance_scale: multiplies the second term.
         motion_scale: multiplies the penalty.
         as_printed: with the signs of equations 2 and 3 as printed (new minus old), which reward a growing error.
+        every_object: equation 2 is of the sum over all objects; in the paper, of the attended object.
 
     Raises:
         ValueError: alpha or beta is outside [0, 1].
@@ -36,6 +37,7 @@ class RewardParameters:
     distance_scale: float = 0.1
     motion_scale: float = 0.02
     as_printed: bool = False
+    every_object: bool = False
 
     def __post_init__(self) -> None:
         if not (0 <= self.alpha <= 1 and 0 <= self.beta <= 1):
@@ -130,11 +132,11 @@ class Episodes:
         within = index < before.objects.shape[1]
         row[within] = before.objects[each[within], index[within]]
         target = self.lookup.nearest_object[row]
-        error_drop = (errors[each, target] - self._errors[each, target]) / self._error_unit
-        attends = row >= 0
-        reward = self.reward.combine(
-            np.where(attends, error_drop, 0.0), np.where(attends, self._approach(row, last, view), 0.0), motion
-        )
+        falls, attends = (errors - self._errors) / self._error_unit, row >= 0
+        error_drop = np.where(attends, falls[each, target], 0.0)
+        if self.reward.every_object:
+            error_drop = falls.sum(axis=1)
+        reward = self.reward.combine(error_drop, np.where(attends, self._approach(row, last, view), 0.0), motion)
         return reward, self.time == self.steps
 
     def _approach(self, row: np.ndarray, last: np.ndarray, view: np.ndarray) -> np.ndarray:
