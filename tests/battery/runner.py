@@ -42,7 +42,7 @@ def run(
         seconds: no trial begins later, unless ``most`` is given.
         seed: of the trials.
         most: number of trials in place of a time.
-        on_trial: called before each trial with the numbers of trials and of failures so far.
+        on_trial: called before each trial with the number of trials and what failed so far.
 
     Returns:
         the number of trials, what failed, and what the attack says of all trials.
@@ -52,7 +52,7 @@ def run(
     source = attack()
     trial, deadline = next(source), time.monotonic() + seconds
     while trials < most if most is not None else time.monotonic() < deadline:
-        on_trial(trials, len(failures))
+        on_trial(trials, failures)
         try:
             failure = trial(np.random.default_rng([seed, trials]))
         except Exception:
@@ -91,16 +91,20 @@ def main() -> int:
 
 
 class _Progress:
-    """One line for a person who watches a terminal, some times a second."""
+    """What has failed as soon as it has, and one line for a person who watches a terminal, some times a second."""
 
     def __init__(self, name: str) -> None:
-        self._name, self._began, self._next = name, time.monotonic(), 0.0
+        self._name, self._began, self._next, self._told = name, time.monotonic(), 0.0, 0
 
-    def show(self, trials: int, failures: int) -> None:
+    def show(self, trials: int, failures: list[str]) -> None:
         """Say where the attack is."""
+        for failure in failures[self._told :]:
+            self.clear()
+            print(f"{self._name}, {failure}", file=sys.stderr, flush=True)
+        self._told = len(failures)
         if sys.stderr.isatty() and time.monotonic() > self._next:
             seconds = time.monotonic() - self._began
-            text = f"{self._name}: {trials} trials, {failures} failures, {seconds:.0f} s"
+            text = f"{self._name}: {trials} trials, {self._told} failures, {seconds:.0f} s"
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
             self._next = time.monotonic() + 0.2
 

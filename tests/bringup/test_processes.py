@@ -13,6 +13,7 @@ from rclpy.task import Future
 from ros_harness import fresh_domain
 
 from active6d_bringup.bags.reader import read_episode
+from active6d_bringup.graph import episode as episode_module
 from active6d_bringup.graph import processes as processes_module
 from active6d_bringup.graph.composition import GraphDescription, running
 from active6d_bringup.graph.episode import EpisodeInterrupted, EpisodeSettings, run_episode
@@ -56,6 +57,14 @@ def killer(graphs, victim, index=1):
             os.kill(graphs[0].processes[victim].pid, signal.SIGKILL)
 
     return kill
+
+
+@pytest.mark.slow
+def test_an_episode_waits_for_a_recorder_that_starts_again(graphs, tmp_path, monkeypatch):
+    monkeypatch.setattr(episode_module, "_SETTLE_SECONDS", 0.5)  # a recorder takes longer to start
+    result = run_episode(settings(tmp_path / "bag"), killer(graphs, "episode_recorder", 0))
+    assert len(read_episode(tmp_path / "bag").steps) == len(result.steps) == 4
+    assert (tmp_path / "bag" / "metadata.yaml").is_file()
 
 
 @pytest.mark.slow

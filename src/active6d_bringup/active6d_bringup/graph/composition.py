@@ -23,6 +23,8 @@ from active6d_core.ros.publishers import others_in_domain
 from active6d_core.structured_text import read_yaml
 
 OnEvent = Callable[[str], None]
+#: What is missing as long as a recorder has not said what it lacks.
+UNANSWERED = "the recorder's answer"
 
 
 class EpisodeInterrupted(KeyboardInterrupt):

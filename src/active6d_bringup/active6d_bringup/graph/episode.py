@@ -19,6 +19,7 @@ from sensor_msgs.msg import PointCloud2
 
 from active6d_bringup.bags.writer import RecordingError
 from active6d_bringup.graph.composition import (
+    UNANSWERED,
     ComposedGraph,
     Graph,
     GraphDescription,
@@ -292,10 +293,12 @@ def _spin_to_end(
         unrecorded = [] if awaited else graph.missing(monitor.end_stamp or 0)
         if not awaited and not unrecorded:
             return
-        if progress != (monitor.received, monitor.end_stamp):
-            progress, since = (monitor.received, monitor.end_stamp), time.monotonic()
+        # A recorder that is starting again has not taken yet what is latched.
+        starting = UNANSWERED in unrecorded
+        if progress != (monitor.received, monitor.end_stamp, starting):
+            progress, since = (monitor.received, monitor.end_stamp, starting), time.monotonic()
         idle = time.monotonic() - since
-        if not awaited and graph.restarted and idle > _SETTLE_SECONDS:
+        if not awaited and graph.restarted and not starting and idle > _SETTLE_SECONDS:
             # A publisher that dies while publishing does not reach every subscriber: the recorder may lack a message.
             note(f"the bag is not complete: no answer from {topics.describe_missing(unrecorded)}")
             return

@@ -20,7 +20,13 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from active6d_bringup.graph.composition import EpisodeInterrupted, GraphDescription, OnEvent, open_context
+from active6d_bringup.graph.composition import (
+    UNANSWERED,
+    EpisodeInterrupted,
+    GraphDescription,
+    OnEvent,
+    open_context,
+)
 from active6d_bringup.graph.liveness import HUNG_SECONDS, Pulses
 from active6d_core.interrupts import INTERRUPTS
 from active6d_core.ros.graph_nodes import BAD_PARAMETERS, MAX_RESTARTS, NODES
@@ -73,7 +79,9 @@ class ProcessGraph:
         self._started = False
         self._pulses = Pulses(self._node)
         self._complete = self._node.create_client(Trigger, "episode_recorder/complete")
-        self._recorded: Any = None
+        self._recorded: list[Any] = []
+        self._asked = 0.0
+        self._unrecorded = [UNANSWERED]
 
     def add(self, node: Node) -> None:
         """Spin one more node of the caller's in this process."""
@@ -119,12 +127,13 @@ class ProcessGraph:
         """What the recorder's process still waits for."""
         if "episode_recorder" not in self.processes:
             return []
-        if self._recorded is None:
-            self._recorded = self._complete.call_async(Trigger.Request())
-        if not self._recorded.done():
-            return ["the recorder's answer"]
-        answer, self._recorded = self._recorded.result(), None
-        return [] if answer.success else [f"episode_recorder, {answer.message}"]
+        if not self._recorded:
+            self._asked = time.monotonic()
+        if _answered(self._complete, self._recorded, self._asked):
+            answer = next(answer for answer in self._recorded if answer.done()).result()
+            self._recorded = []
+            self._unrecorded = [] if answer.success else [f"episode_recorder, {answer.message}"]
+        return self._unrecorded
 
     def close(self) -> None:
         """Interrupt every process, the recorder last so that it sees all of them end; kill what does not listen."""
@@ -143,6 +152,8 @@ class ProcessGraph:
         parameters = {**description.nodes[name], "autostart": autostart}
         if name == "episode_recorder" and self._started:
             parameters["resume"] = True
+            # What its predecessor was asked is not answered any more.
+            self._recorded, self._unrecorded = [], [UNANSWERED]
         self._pulses.forget(name)
         command = [sys.executable, "-m", NODES[name].module, *description.ros_arguments()]
         if description.namespace:
@@ -201,11 +212,11 @@ class ProcessGraph:
 
 
 def _answered(client: Client, answers: list[Any], began: float) -> bool:
-    """Whether one of the calls was answered; after some seconds without, one more is made.
+    """Whether one of the calls was answered; the first is made at once, and one more after some seconds without.
 
     A service that has not discovered its client yet cannot answer: the middleware drops what it sends.
     """
-    if time.monotonic() > began + _ASK_AGAIN_SECONDS * len(answers):
+    if time.monotonic() >= began + _ASK_AGAIN_SECONDS * len(answers):
         answers.append(client.call_async(Trigger.Request()))
     return any(answer.done() for answer in answers)
 
