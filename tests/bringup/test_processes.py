@@ -60,6 +60,19 @@ def killer(graphs, victim, index=1):
 
 
 @pytest.mark.slow
+def test_a_node_that_hangs_at_the_first_view_is_noticed(graphs):
+    events = []
+
+    def stop(step):
+        if step.index == 0:
+            os.kill(graphs[0].processes["attention_policy"].pid, signal.SIGSTOP)
+
+    result = run_episode(settings(patience=30.0), stop, events.append)
+    assert sum("attention_policy hangs" in event for event in events) == 1
+    assert len(result.steps) == 4
+
+
+@pytest.mark.slow
 def test_an_episode_waits_for_a_recorder_that_starts_again(graphs, tmp_path, monkeypatch):
     monkeypatch.setattr(episode_module, "_SETTLE_SECONDS", 0.5)  # a recorder takes longer to start
     result = run_episode(settings(tmp_path / "bag"), killer(graphs, "episode_recorder", 0))

@@ -293,7 +293,7 @@ def _spin_to_end(
         unrecorded = [] if awaited else graph.missing(monitor.end_stamp or 0)
         if not awaited and not unrecorded:
             return
-        # A recorder that is starting again has not taken yet what is latched.
+        # A recorder that starts again has not received the transient local messages yet.
         starting = UNANSWERED in unrecorded
         if progress != (monitor.received, monitor.end_stamp, starting):
             progress, since = (monitor.received, monitor.end_stamp, starting), time.monotonic()

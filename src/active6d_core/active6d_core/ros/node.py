@@ -163,6 +163,8 @@ class GraphNode(DiagnosticNode):
             result = self._attempt(self._take_held)
         if result != TransitionCallbackReturn.SUCCESS:
             self.on_deactivate(state)
+        elif self.value("heartbeat") > 0:
+            self.beat()  # a supervisor judges only who has begun to beat, and the node may hang at its first input
         return result
 
     def _take_held(self) -> None:
