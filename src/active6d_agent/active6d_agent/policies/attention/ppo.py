@@ -304,7 +304,9 @@ def _restore(ppo: PPO, folder: Path, identity: dict[str, Any]) -> tuple[tuple[fl
         state, tensors = json.loads(path.with_suffix(".json").read_text()), load_file(path)
     except Exception as error:  # safetensors raises its own kinds
         raise ValueError(f"{path}: nothing to resume from ({error})") from error
-    if any(state.get(key) != value for key, value in identity.items()):
+    # Parameters that did not exist when it was written had what is now their default.
+    defaults = {"parameters": asdict(PpoParameters()), "reward": asdict(RewardParameters())}
+    if any({**defaults[key], **state.get(key, {})} != value for key, value in identity.items()):
         raise ValueError(f"{path}: was trained with other parameters; start again without resuming")
     ppo.policy.load_state_dict({k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")})
     adam: dict[int, dict[str, torch.Tensor]] = {}
