@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import psutil
+from rosbags.rosbag2 import Reader
 from stub_episode import StubEpisode
 from synthetic_bank import synthetic_bank
 from test_bag_reader import damage_of, write_bag
@@ -170,11 +171,19 @@ def interrupts() -> Iterator[Trial]:
                 wrong += [f"{seconds:.1f} s"] * (seconds > latest)
                 wrong += [f"left: {each}" for each in left]
                 wrong += [f"said {command.text()}"] * ("Traceback" in command.text())
-                if (folder / "bag").exists() and code is not None:
-                    wrong += damage_of(folder / "bag")
+                if (folder / "bag").exists():
+                    wrong += _not_closed(folder / "bag")
                 return f"{kind} after {delay:.2f} s: {'; '.join(wrong)}" if wrong else ""
 
         yield trial
+
+
+def _not_closed(bag: Path) -> list[str]:
+    """What is wrong with a bag that must be whole, whether it holds a view or not yet."""
+    if not (bag / "metadata.yaml").is_file():
+        return ["the bag is not closed"]
+    with Reader(bag) as reader:
+        return ["messages are missing"] * (sum(1 for _ in reader.messages()) != reader.message_count)
 
 
 def _wait_for_handler(process: subprocess.Popen[str]) -> None:
