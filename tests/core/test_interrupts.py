@@ -34,6 +34,20 @@ if __name__ == "__main__":
         print("ready", flush=True)
         jobs[0].result()
 """
+# Nearly all of its time goes into what compiled code does with the arrays that it returns.
+COMPILED = """
+import numba, numpy as np
+from active6d_core.interrupts import INTERRUPTS
+INTERRUPTS.watch()
+@numba.njit
+def many():
+    a = np.empty(1)
+    return a, a.copy(), a.copy(), a.copy(), a.copy(), a.copy(), a.copy(), a.copy()
+many()
+print("ready", flush=True)
+while True:
+    many()
+"""
 
 
 def start(script, *arguments):
@@ -50,6 +64,14 @@ def test_a_command_that_does_not_end_is_ended(number):
     assert process.wait(10) == 130
     assert time.monotonic() - began < 2
     assert process.stdout.read() == "closed\n"
+
+
+def test_compiled_code_does_not_crash():
+    for _ in range(3):
+        with start(COMPILED, "-c") as process:
+            process.send_signal(signal.SIGINT)
+            # A KeyboardInterrupt that nobody catches ends an interpreter by SIGINT; on a busy machine, the thread does.
+            assert process.wait(10) in (-signal.SIGINT, 130), "-11 is a crash"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])

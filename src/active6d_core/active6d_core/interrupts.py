@@ -5,17 +5,22 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from types import FrameType
+from typing import cast
 
 #: Exit code of what a Ctrl-C has ended.
 INTERRUPTED = 130
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _PR_SET_PDEATHSIG = 1
+# Numba's compiled code calls this for every array that it returns, and crashes if an exception comes of it.
+_UNINTERRUPTIBLE = "_numba_unpickle"
+_RETRY_SECONDS = 0.01
 
 
 class Interrupts:
@@ -34,6 +39,7 @@ class Interrupts:
         self.grace = 1.0
         self.seen = threading.Event()
         self._last: list[Callable[[], None]] = []
+        self._postponed: int | None = None
 
     def watch(self) -> None:
         """Start watching; call it once, in the main thread."""
@@ -56,6 +62,11 @@ class Interrupts:
     def _raise(self, number: int, frame: FrameType | None) -> None:
         # The thread may come too late to say so: the exception can be caught and the process at its end before.
         self.seen.set()
+        while frame is not None:
+            if frame.f_code.co_name == _UNINTERRUPTIBLE:
+                self._postponed = number
+                return
+            frame = frame.f_back
         raise KeyboardInterrupt
 
     def _wait(self, read: int) -> None:
@@ -63,7 +74,12 @@ class Interrupts:
             pass
         self.seen.set()
         # Not the main thread's end, but the process's is awaited: this thread is a daemon and ends with it.
-        threading.Event().wait(self.grace)
+        end = time.monotonic() + self.grace
+        while (left := end - time.monotonic()) > 0:
+            threading.Event().wait(min(left, _RETRY_SECONDS))
+            number, self._postponed = self._postponed, None
+            if number is not None:
+                signal.pthread_kill(cast(int, threading.main_thread().ident), number)
         for action in reversed(self._last):
             with suppress(Exception):
                 action()
