@@ -74,6 +74,28 @@ def test_compiled_code_does_not_crash():
             assert process.wait(10) in (-signal.SIGINT, 130), "-11 is a crash"
 
 
+# A signal that comes while LLVM calls Python back.
+CALLED_BACK = """
+import signal, time
+from active6d_core.interrupts import INTERRUPTS
+INTERRUPTS.watch()
+def _raw_object_cache_notify():
+    signal.raise_signal(signal.SIGINT)
+    return "went on"
+print("ready", flush=True)
+print(_raw_object_cache_notify(), flush=True)
+try:
+    time.sleep(0.5)
+except KeyboardInterrupt:
+    print("interrupted later", flush=True)
+"""
+
+
+def test_a_call_back_from_c_is_not_interrupted():
+    with start(CALLED_BACK, "-c") as process:
+        assert process.stdout.read() == "went on\ninterrupted later\n"
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_pool_ends_with_its_command(tmp_path, number):
     (tmp_path / "pool.py").write_text(POOL)

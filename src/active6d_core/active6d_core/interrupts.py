@@ -18,8 +18,9 @@ from typing import cast
 INTERRUPTED = 130
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _PR_SET_PDEATHSIG = 1
-# Numba's compiled code calls this for every array that it returns, and crashes if an exception comes of it.
-_UNINTERRUPTIBLE = "_numba_unpickle"
+# Functions that C code calls without a look at their exceptions. Numba's compiled code calls the first for every array
+# that it returns, and crashes. LLVM calls the others while it compiles, and the exception is lost.
+_UNINTERRUPTIBLE = {"_numba_unpickle", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
 _RETRY_SECONDS = 0.01
 
 
@@ -63,7 +64,7 @@ class Interrupts:
         # The thread may come too late to say so: the exception can be caught and the process at its end before.
         self.seen.set()
         while frame is not None:
-            if frame.f_code.co_name == _UNINTERRUPTIBLE:
+            if frame.f_code.co_name in _UNINTERRUPTIBLE:
                 self._postponed = number
                 return
             frame = frame.f_back
