@@ -123,7 +123,7 @@ def fill(page: str, measured: Mapping[str, Measured]) -> str:
             raise ValueError(f"docs/results.md has a block '{match[2]}'; known are {', '.join(BLOCKS)}")
         return f"{match[1]}\n{BLOCKS[match[2]](measured)}\n{match[3]}"
 
-    return re.sub(r"(<!-- results: ([\w ]+) -->)\n.*?(<!-- end -->)", renew, page, flags=re.DOTALL)
+    return re.sub(r"(<!-- results: ([\w -]+) -->)\n.*?(<!-- end -->)", renew, page, flags=re.DOTALL)
 
 
 def _of_job(name: str, measured: Mapping[str, Measured]) -> dict[str, dict[str, Any]]:
