@@ -32,15 +32,21 @@ def test_only_confirmed_objects_count_and_wrong_ones_are_told():
     assert row["auc"] == pytest.approx(0.5)
 
 
-@pytest.mark.slow
-def test_methods_fuse_the_same_views(tmp_path, monkeypatch):
+@pytest.fixture
+def stored_mugs(tmp_path, monkeypatch):
+    """The name of a stored scene of three mugs."""
     monkeypatch.setenv("ACTIVE6D_SCENE_PATH", str(tmp_path))
-    mugs = three_mugs()
+    mugs, name = three_mugs(), "mug/val/0"
     (tmp_path / "mug").mkdir()
-    make_scene(mugs.T_world_object, mugs.bin, "mug/val/0", 2).save(tmp_path / "mug" / "val_00.npz")
+    make_scene(mugs.T_world_object, mugs.bin, name, 2).save(tmp_path / "mug" / "val_00.npz")
+    return name
+
+
+@pytest.mark.slow
+def test_methods_fuse_the_same_views(stored_mugs, monkeypatch):
     indifferent = lambda path: BeliefWeights.indifferent()
     monkeypatch.setattr("active6d_perception.scene.joint_fusion.load_belief", indifferent)
-    results = compare_methods(["mug/val/0"], kinds=("ring",), episodes=1, parameters=FusionParameters(confirmed=0.0))
+    results = compare_methods([stored_mugs], kinds=("ring",), episodes=1, parameters=FusionParameters(confirmed=0.0))
     assert set(results["ring"]) == {"best-view", "all-views"}
     for row in results["ring"].values():
         # Most mugs are found; with indifferent weights the rotation may be wrong.
@@ -50,13 +56,9 @@ def test_methods_fuse_the_same_views(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_camera_errors_cost_accuracy_and_equal_ones_nothing(tmp_path, monkeypatch):
-    monkeypatch.setenv("ACTIVE6D_SCENE_PATH", str(tmp_path))
-    mugs = three_mugs()
-    (tmp_path / "mug").mkdir()
-    make_scene(mugs.T_world_object, mugs.bin, "mug/val/0", 2).save(tmp_path / "mug" / "val_00.npz")
+def test_camera_errors_cost_accuracy_and_equal_ones_nothing(stored_mugs):
     parameters = FusionParameters(confirmed=0.0)
-    rows = measure_errors(["mug/val/0"], parse_errors("0/0,8/0"), episodes=1, parameters=parameters)
+    rows = measure_errors([stored_mugs], parse_errors("0/0,8/0"), episodes=1, parameters=parameters)
     assert [(row["millimetres"], row["variant"]) for row in rows] == [
         (0, "aligned"), (0, "not aligned"), (8, "aligned"), (8, "not aligned")
     ]  # fmt: skip

@@ -25,12 +25,12 @@ from active6d_sim.scenes.scene_store import SPLITS, find_scene, load_scene
 FIRST_HEAP = {"train": 50_000, "val": 60_000, "test": 70_000}
 
 
-def scene_names(object_name: str, split: str, scenes: int | None, heaps: int) -> list[str]:
-    """Names of a bank's scenes: stored scenes of the split, then piles that are simulated by their seed.
+def scene_names(object_name: str, split: str, scenes: int | None, heaps: int = 0) -> list[str]:
+    """Names of scenes: stored scenes of the split, then piles that are simulated by their seed.
 
     Args:
         object_name: of the objects in the scenes.
-        split: train, val or test.
+        split: of the stored scenes.
         scenes: number of stored scenes; None for all.
         heaps: number of simulated piles.
 

@@ -43,13 +43,21 @@ class RewardParameters:
         if not (0 <= self.alpha <= 1 and 0 <= self.beta <= 1):
             raise ValueError(f"reward: alpha and beta must be in [0, 1], got {self.alpha} and {self.beta}")
 
-    def combine(self, error_drop: np.ndarray, approach: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """Equation 4 from the decrease of error and distance to the object, and the L1 length of the move."""
+    def terms(self, error_drop: np.ndarray, approach: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        """(3, E) summands of equation 4, in the order of the arguments.
+
+        Args:
+            error_drop: (E,) decrease of the error.
+            approach: (E,) decrease of the distance to the object.
+            motion: (E,) L1 length of the move.
+        """
         sign = -1.0 if self.as_printed else 1.0
-        return (
-            (1 - self.alpha) * self.error_scale * sign * error_drop
-            + self.alpha * self.beta * self.distance_scale * sign * approach
-            - (1 - self.alpha) * (1 - self.beta) * self.motion_scale * motion
+        return np.stack(
+            [
+                (1 - self.alpha) * self.error_scale * sign * error_drop,
+                self.alpha * self.beta * self.distance_scale * sign * approach,
+                -(1 - self.alpha) * (1 - self.beta) * self.motion_scale * motion,
+            ]
         )
 
 
@@ -90,6 +98,8 @@ class Episodes:
         self.time = np.zeros(count, int)
         self.views = np.full((count, steps + 1), -1)
         self.free = np.tile(self._allowed, (count, 1))
+        #: (3, E) summands of the last move's rewards: error, distance and motion.
+        self.terms = np.zeros((3, count))
         self.fused: FusedBatch = lookup.fuse(self.scene, self.views, self.scene)
 
     @property
@@ -136,8 +146,9 @@ class Episodes:
         error_drop = np.where(attends, falls[each, target], 0.0)
         if self.reward.every_object:
             error_drop = falls.sum(axis=1)
-        reward = self.reward.combine(error_drop, np.where(attends, self._approach(row, last, view), 0.0), motion)
-        return reward, self.time == self.steps
+        approach = np.where(attends, self._approach(row, last, view), 0.0)
+        self.terms = self.reward.terms(error_drop, approach, motion)
+        return self.terms.sum(axis=0), self.time == self.steps
 
     def _approach(self, row: np.ndarray, last: np.ndarray, view: np.ndarray) -> np.ndarray:
         """Decrease of equation 3's distance; the attended object is now the one nearest to its old position."""

@@ -13,8 +13,6 @@ from active6d_tools.benchmark.fusion_methods import KINDS, MethodResults, draw_e
 from active6d_tools.processed_scene import ProcessedScene, disturb
 from active6d_tools.report.line_plots import Panel
 
-#: Root mean squares of the camera's errors: shift and rotation.
-ERRORS = (PoseError(0, 0), PoseError(2, 0.2), PoseError(5, 0.5), PoseError(10, 1), PoseError(20, 1.5))
 ALIGNED, NOT_ALIGNED = "aligned", "not aligned"
 
 
@@ -38,7 +36,7 @@ def parse_errors(text: str) -> list[PoseError]:
 
 def measure_errors(
     names: Sequence[str],
-    errors: Sequence[PoseError] = ERRORS,
+    errors: Sequence[PoseError],
     *,
     episodes: int = 2,
     estimator: str = AUTOMATIC,

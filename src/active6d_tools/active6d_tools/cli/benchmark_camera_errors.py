@@ -34,16 +34,13 @@ def camera_errors(
 
     Example: [bold]active6d benchmark camera-errors --object mug --scenes 2 --errors 0/0,5/0.5 --png errors.png[/bold]
     """
-    from active6d_core.object_model import load_object
     from active6d_perception.scene.fusion import FusionParameters
-    from active6d_sim.scenes.scene_store import SPLITS, load_scene
+    from active6d_tools.bank_building import scene_names
     from active6d_tools.benchmark.camera_errors import error_panels, measure_errors, parse_errors
     from active6d_tools.report.line_plots import draw_panels
 
     parsed = parse_errors(errors)
-    load_object(object_name)
-    load_scene(object_name, split, 0)  # refuses an unknown split
-    names = [f"{object_name}/{split}/{index}" for index in range(min(scenes or SPLITS[split], SPLITS[split]))]
+    names = scene_names(object_name, split, scenes)
     settings: dict[str, Any] = {"episodes": episodes, "estimator": estimator, "seed": seed}
     with work_progress() as on_progress:
         rows = measure_errors(

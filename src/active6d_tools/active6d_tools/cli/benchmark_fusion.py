@@ -43,17 +43,14 @@ def fusion(
 
     Example: [bold]active6d benchmark fusion --object mug --scenes 2 --json fusion.json[/bold]
     """
-    from active6d_core.object_model import load_object
     from active6d_perception.scene.fusion import FusionParameters
-    from active6d_sim.scenes.scene_store import SPLITS, load_scene
+    from active6d_tools.bank_building import scene_names
     from active6d_tools.benchmark.fusion_methods import KINDS, compare_methods
 
     chosen = [kind.strip() for kind in kinds.split(",")]
     if unknown := set(chosen) - set(KINDS):
         raise ValueError(f"--kinds: '{min(unknown)}' is not among {', '.join(KINDS)}")
-    load_object(object_name)
-    load_scene(object_name, split, 0)  # refuses an unknown split
-    names = [f"{object_name}/{split}/{index}" for index in range(min(scenes or SPLITS[split], SPLITS[split]))]
+    names = scene_names(object_name, split, scenes)
     settings: dict[str, Any] = {"kinds": chosen, "episodes": episodes, "estimator": estimator, "seed": seed}
     with work_progress() as on_progress:
         results = compare_methods(

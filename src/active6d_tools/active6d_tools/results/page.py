@@ -160,11 +160,13 @@ def _each(make: Callable[[dict[str, Any]], str]) -> Callable[[tables.Reports], s
     return render
 
 
-def _against(name: str) -> Callable[[dict[str, Any]], str]:
+def _differences(job: str, name: str) -> Callable[[Mapping[str, Measured]], str]:
+    """The policy ``name`` minus every other one, of each object."""
+
     def render(report: dict[str, Any]) -> str:
         return tables.differences_table(report, name) if name in report["policies"] else "Not measured yet."
 
-    return render
+    return lambda measured: _each(render)(_of_job(job, measured))
 
 
 def _variants(*keys: str) -> Callable[[tables.Reports], str]:
@@ -177,12 +179,12 @@ BLOCKS: dict[str, Callable[[Mapping[str, Measured]], str]] = {
     "goals": lambda measured: goals_table(GOALS, measured),
     "claims": lambda measured: goals_table(CLAIMS, measured, "reproduced"),
     "evaluate": _block("evaluate", _each(tables.policies_table)),
-    "default differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate", measured)),
-    "paper differences": lambda measured: _each(_against(PAPERS))(_of_job("evaluate", measured)),
+    "default differences": _differences("evaluate", DEFAULT),
+    "paper differences": _differences("evaluate", PAPERS),
     "evaluate thirty": _block("evaluate_thirty", _each(tables.policies_table)),
-    "thirty differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate_thirty", measured)),
+    "thirty differences": _differences("evaluate_thirty", DEFAULT),
     "evaluate wild": _block("evaluate_wild", _each(tables.policies_table)),
-    "wild differences": lambda measured: _each(_against(DEFAULT))(_of_job("evaluate_wild", measured)),
+    "wild differences": _differences("evaluate_wild", DEFAULT),
     "evaluate three": _block("evaluate_three", _each(tables.policies_table)),
     "evaluate four": _block("evaluate_four", _each(tables.policies_table)),
     "evaluate ten": _block("evaluate_ten", _each(tables.policies_table)),

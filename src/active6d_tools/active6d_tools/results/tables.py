@@ -157,6 +157,10 @@ def camera_errors_table(reports: Reports) -> str:
     return table(["", *reports], [[error, *(cell(report, error) for report in reports.values())] for error in errors])
 
 
+def _camera_error(row: dict[str, Any]) -> str:
+    return f"{row['millimetres']:g} mm, {row['degrees']:g} degrees"
+
+
 def seeds_table(reports: Reports) -> str:
     """Every training: detection rate, error, validation result, minutes, and whether it is shipped."""
 
@@ -168,10 +172,6 @@ def seeds_table(reports: Reports) -> str:
         return ", ".join(filter(None, (found, on_validation, f"{row['training_minutes']:.0f} min", ships)))
 
     return _pivot(reports, lambda row: row["variant"], render)
-
-
-def _camera_error(row: dict[str, Any]) -> str:
-    return f"{row['millimetres']:g} mm, {row['degrees']:g} degrees"
 
 
 def steps_tables(reports: Reports) -> str:

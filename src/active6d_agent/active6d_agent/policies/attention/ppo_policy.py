@@ -85,7 +85,6 @@ class PaperPolicy(ActorCriticPolicy):
             "features_extractor_class": AttentionExtractor,
             "net_arch": [128],
             "activation_fn": nn.ReLU,
-            "log_std_init": -0.5,
         }
         super().__init__(observation_space, angles, lr_schedule, **{**settings, **keywords})
         self.action_space, self.credit = action_space, credit
