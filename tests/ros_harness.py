@@ -4,11 +4,13 @@ A callback's exception leaves :meth:`GraphHarness.spin_until` and so fails the t
 raises it again.
 """
 
+import gc
 import itertools
 import os
 import time
 from collections.abc import Callable, Iterable
 
+from rcl_interfaces.msg import Log
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -92,6 +94,16 @@ class GraphHarness:
         messages: list = []
         self.node.create_subscription(message_type, topic, messages.append, reliable(latched))
         return messages
+
+    def log(self) -> list[Log]:
+        """A mailbox of the log lines of all nodes that are added after this call.
+
+        A node whose constructor raised lives until it is collected. Then it removes the /rosout publisher of any node
+        with its name, even of a later test, so it is collected first.
+        """
+        assert not self._nodes, "log() comes before the first node"
+        gc.collect()
+        return self.mailbox(Log, "/rosout", latched=True)
 
     def publish(self, topic: str, message, latched: bool = False, subscribers: int = 1, timeout: float = 5.0) -> None:
         """Publish reliably as soon as ``subscribers`` have found the publisher."""

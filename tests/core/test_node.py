@@ -12,7 +12,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from hypothesis import given
 from hypothesis import strategies as st
-from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.parameter import Parameter
@@ -181,8 +180,8 @@ def test_the_heartbeat_names_what_is_awaited_and_since_when(graph):
 
 
 def test_a_topic_without_publisher_is_a_warning_that_names_it_once(graph):
+    logged = graph.log()
     node = graph.add(DepthNode(context=graph.context))
-    logged = graph.mailbox(Log, "/rosout", latched=True)
     now = [100.0]
     node._watch = Watch(node, lambda: now[0])
     node.wanted = Awaited(("depth",))
@@ -202,8 +201,8 @@ def test_a_topic_without_publisher_is_a_warning_that_names_it_once(graph):
 
 
 def test_an_incompatible_publisher_is_named_as_the_cause(graph):
+    logged = graph.log()
     node = graph.add(DepthNode(context=graph.context))
-    logged = graph.mailbox(Log, "/rosout", latched=True)
     graph.node.create_publisher(Image, "depth", QoSProfile(depth=1, durability=DurabilityPolicy.VOLATILE))
     cause = "a publisher of depth offers an incompatible QoS (durability)"
     graph.spin_until(lambda: any(cause in entry.msg for entry in logged))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray
-from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, PointCloud2
@@ -388,7 +387,7 @@ def test_fusion_without_a_writable_cache_sends_no_markers(graph, seen, tmp_path,
     (tmp_path / "cache").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     objects, markers = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(MarkerArray, "objects/markers", True)
-    logged = graph.mailbox(Log, "/rosout", latched=True)
+    logged = graph.log()
     graph.add(HypothesisFusionNode(context=graph.context))
     send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
     graph.spin_until_filled([objects, markers])
