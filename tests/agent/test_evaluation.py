@@ -192,7 +192,7 @@ def test_differences_are_resampled_by_scene_start_by_start(lookup, starts):
         differences = getattr(results["max-distance"], name) - getattr(results["random"], name)
         by_scene = sorted(differences[starts[:, 0] == scene].mean() for scene in (0, 1))
         np.testing.assert_allclose(told["ci95_scenes"], by_scene)
-        assert told["excludes_zero_scenes"] == (np.sign(by_scene).sum() != 0)
+        assert told["excludes_zero_scenes"] == (by_scene[0] > 0 or by_scene[1] < 0)
         assert told["mean"] == pytest.approx(differences.mean())
 
 
@@ -205,5 +205,15 @@ def test_confirmed_objects_are_counted_by_hand(lookup, starts):
         true = lookup.bank.scenes[scene].T_world_object
         assert results.confirmed_rate[index] == pytest.approx(evaluate_scene(lookup.model, sure, true).detection_rate)
         right = (e_add(lookup.model, sure[:, None], true) < limit).any(axis=1)
-        assert results.wrong[index] == pytest.approx(1 - right.mean() if len(right) else 0.0)
-    assert 0 < results.wrong.mean() < 1
+        assert (results.confirmed[index], results.wrong[index]) == (len(right), (~right).sum())
+    row = evaluation.describe(results.measures, evaluation.Intervals(results.scene))
+    assert 0 < row["wrong"] == pytest.approx(results.wrong.sum() / results.confirmed.sum())
+    low, high = row["wrong_ci95"]
+    assert low <= row["wrong"] <= high
+
+
+def test_nothing_confirmed_has_no_share_of_wrong_objects():
+    nothing = {"confirmed": np.zeros(2), "wrong": np.zeros(2)}
+    row = evaluation.describe(nothing, evaluation.Intervals(np.array([0, 1])))
+    assert row["wrong"] is None
+    assert row["confirmed"] == 0

@@ -15,7 +15,7 @@ from active6d_core.metrics import DETECTION_FRACTION, score_errors
 
 MEASURES = ("detection_rate", "e_add_mm", "distance_m")
 #: Measures of the objects that are confirmed by their probability.
-CONFIRMED = ("confirmed_rate", "wrong")
+CONFIRMED = ("confirmed_rate", "confirmed", "wrong")
 #: From (b,) indices of the running episodes and their observations to (b,) next views, -1 to stop.
 Choose = Callable[[np.ndarray, list[Observation]], np.ndarray]
 
@@ -31,7 +31,8 @@ class EpisodeResults:
         distance_m: (E,) along the hemisphere.
         views: (E, T + 1) views taken, -1 after an early stop.
         confirmed_rate: (E,) fraction of the objects that a confirmed object finds; None if there is no probability.
-        wrong: (E,) share of the confirmed objects that find none, 0 without any; None likewise.
+        confirmed: (E,) number of confirmed objects; None likewise.
+        wrong: (E,) number of confirmed objects that find none; None likewise.
     """
 
     scene: np.ndarray
@@ -40,6 +41,7 @@ class EpisodeResults:
     distance_m: np.ndarray
     views: np.ndarray
     confirmed_rate: np.ndarray | None = None
+    confirmed: np.ndarray | None = None
     wrong: np.ndarray | None = None
 
     @property
@@ -143,10 +145,11 @@ def score_fused(lookup: SceneLookup, fused: FusedBatch, scene: np.ndarray, views
     scores = lookup.evaluate(fused, scene)
     positions = lookup.sphere.positions[views]
     arcs = np.where(views[:, 1:] >= 0, lookup.sphere.arc(positions[:, :-1], positions[:, 1:]), 0.0)
-    confirmed = _score_confirmed(lookup, fused, scene)
+    rate, confirmed, wrong = _score_confirmed(lookup, fused, scene)
     return EpisodeResults(
-        confirmed_rate=confirmed[:, 0],
-        wrong=confirmed[:, 1],
+        confirmed_rate=rate,
+        confirmed=confirmed,
+        wrong=wrong,
         scene=scene,
         detection_rate=np.array([score.detection_rate for score in scores]),
         e_add_mm=np.array([score.mean_e_add_mm for score in scores]),
@@ -155,12 +158,14 @@ def score_fused(lookup: SceneLookup, fused: FusedBatch, scene: np.ndarray, views
     )
 
 
-def _score_confirmed(lookup: SceneLookup, fused: FusedBatch, scene: np.ndarray) -> np.ndarray:
-    """(E, 2) fraction of the objects that confirmed ones find, and share of the confirmed ones that find none."""
-    limit, result = DETECTION_FRACTION * lookup.model.diameter, np.zeros((len(scene), 2))
+def _score_confirmed(
+    lookup: SceneLookup, fused: FusedBatch, scene: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(E,) fraction of the objects that confirmed ones find, number of these, and how many of them find none."""
+    limit, rate, wrong = DETECTION_FRACTION * lookup.model.diameter, np.zeros(len(scene)), np.zeros(len(scene))
     sure = (fused.objects >= 0) & (fused.probability >= lookup.parameters.confirmed)
-    for row, objects, own, count in zip(result, fused.objects, sure, lookup.object_count[scene], strict=True):
+    for row, (objects, own, count) in enumerate(zip(fused.objects, sure, lookup.object_count[scene], strict=True)):
         errors = lookup.errors[objects[own], :count]
-        row[0] = score_errors(errors, lookup.model.diameter).detection_rate
-        row[1] = 1 - (errors < limit).any(axis=1).mean() if own.any() else 0.0
-    return result
+        rate[row] = score_errors(errors, lookup.model.diameter).detection_rate
+        wrong[row] = (~(errors < limit).any(axis=1)).sum()
+    return rate, sure.sum(axis=1).astype(float), wrong

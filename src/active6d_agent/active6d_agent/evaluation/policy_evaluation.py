@@ -185,13 +185,25 @@ def evaluate(
 def describe(measures: Measures, intervals: Intervals, first: Measures | None = None) -> dict[str, Any]:
     """The mean of each measure (E,) as ``name``, with ``name_ci95`` and ``name_ci95_scenes`` (:class:`Intervals`).
 
-    With ``first``, also ``against_first``: the paired differences to those measures (:func:`compare`).
+    ``wrong`` is a share of the confirmed objects of all episodes, None without any. A mean over episodes of their
+    shares would count an object in a scene with few of them many times. With ``first``, also ``against_first``: the
+    paired differences to those measures (:func:`compare`).
     """
     row: dict[str, Any] = {}
     for name, values in measures.items():
+        if name == "wrong":
+            row |= _share("wrong", values, measures["confirmed"], intervals)
+            continue
         row[name] = float(values.mean())
         row |= {f"{name}_{kind}": interval for kind, interval in intervals.of(values).items()}
     return row if first is None else {**row, "against_first": compare(measures, first, intervals)}
+
+
+def _share(name: str, part: np.ndarray, whole: np.ndarray, intervals: Intervals) -> dict[str, Any]:
+    if not whole.any():
+        return {name: None}
+    both = intervals.of_ratio(part, whole)
+    return {name: float(part.sum() / whole.sum()), **{f"{name}_{kind}": interval for kind, interval in both.items()}}
 
 
 def compare(own: Measures, other: Measures, intervals: Intervals) -> dict[str, dict[str, Any]]:

@@ -153,7 +153,7 @@ def _print_policies(summary: dict[str, Any]) -> None:
         for key, digits in (("e_add_mm", 2), ("detection_rate", 3)):
             low, high = row[f"{key}_ci95_scenes"]
             cells += [f"{row[key]:.{digits}f}", f"[dim]{low:.{digits}f}-{high:.{digits}f}[/dim]"]
-        cells += [f"{row[key]:.3f}" if key in row else "-" for key in ("confirmed_rate", "wrong")]
+        cells += [f"{row[key]:.3f}" if row.get(key) is not None else "-" for key in ("confirmed_rate", "wrong")]
         rows.append([*cells, "-" if row["gap_closed"] is None else f"{row['gap_closed']:.0%}"])
     title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
     print_table(

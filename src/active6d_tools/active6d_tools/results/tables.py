@@ -80,7 +80,7 @@ def policies_table(report: dict[str, Any]) -> str:
         cells = [f"`{name}`", number(row["distance_m"], 2)]
         for key in ("e_add_mm", "detection_rate", "confirmed_rate", "wrong"):
             digits = MEASURES[key][1]
-            known = key in row
+            known = row.get(key) is not None
             cells.append(f"{number(row[key], digits)} {interval(row[f'{key}_ci95_scenes'], digits)}" if known else "")
         cells.append("" if row["gap_closed"] is None else percent(row["gap_closed"]))
         if paper:
