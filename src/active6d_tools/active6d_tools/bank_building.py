@@ -18,7 +18,7 @@ from active6d_perception.scene.observed_surface import SurfaceGrid
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.simulator import Simulator
-from active6d_sim.scenes.scene_store import SPLITS, find_scene, load_scene
+from active6d_sim.scenes.scene_store import SPLITS, find_scene, load_scene, stored_names
 
 #: Seeds of the piles beside a split's stored scenes start here. No stored scene and no pile that an estimator is
 #: trained on has such a seed.
@@ -43,8 +43,9 @@ def scene_names(object_name: str, split: str, scenes: int | None, heaps: int = 0
         raise ValueError(f"--heaps adds to the scenes of {', '.join(FIRST_HEAP)}, not to split '{split}'")
     load_object(object_name)
     load_scene(object_name, split, 0)  # says how to make the stored scenes if they are missing
-    stored = [f"{object_name}/{split}/{index}" for index in range(min(scenes or SPLITS[split], SPLITS[split]))]
-    return stored + [f"{object_name}/seed/{FIRST_HEAP[split] + index}" for index in range(heaps)]
+    return stored_names(object_name, split, scenes) + [
+        f"{object_name}/seed/{FIRST_HEAP[split] + index}" for index in range(heaps)
+    ]
 
 
 def bank_provenance(object_name: str, estimator: str, noise: float, seed: int) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from active6d_core.registry import AUTOMATIC
 from active6d_perception.scene.belief_training import LabelledPlaces, fit_belief, fit_probability, label_places
 from active6d_perception.scene.belief_weights import BeliefWeights
 from active6d_perception.scene.joint_fusion import JointFusion
-from active6d_sim.scenes.scene_store import SPLITS, scene_path
+from active6d_sim.scenes.scene_store import scene_path, stored_names
 from active6d_tools.processed_scene import ProcessedScene, ProcessedView, add_view
 
 #: Scenes to fit the belief to, and scenes to fit the probability to, which are others: a belief is too sure of the
@@ -80,11 +80,11 @@ def count_scenes(objects: Sequence[str], scenes: int | None) -> int:
 def _names(objects: Sequence[str], splits: Sequence[str], scenes: int | None) -> list[str]:
     """Names of the stored scenes; an object need not have wild ones."""
     return [
-        f"{name}/{split}/{index}"
+        scene
         for name in objects
         for split in splits
         if scene_path(name, split, 0).is_file() or not split.startswith("wild")
-        for index in range(min(scenes or SPLITS[split], SPLITS[split]))
+        for scene in stored_names(name, split, scenes)
     ]
 
 

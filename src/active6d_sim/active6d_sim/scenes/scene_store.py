@@ -36,6 +36,11 @@ def scene_path(object_name: str, split: str, index: int) -> Path:
     return next((folder / relative for folder in extra if (folder / relative).is_file()), SHIPPED_SCENES / relative)
 
 
+def stored_names(object_name: str, split: str, most: int | None = None) -> list[str]:
+    """Names of the stored scenes of a split, such as ``mug/test/3``: all, or the first ``most``."""
+    return [f"{object_name}/{split}/{index}" for index in range(min(most or SPLITS[split], SPLITS[split]))]
+
+
 def load_scene(object_name: str, split: str, index: int) -> Scene:
     """Load a stored scene.
 

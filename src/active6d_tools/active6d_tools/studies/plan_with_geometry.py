@@ -20,7 +20,7 @@ from active6d_agent.environment.rollout import EpisodeResults, measure
 from active6d_agent.evaluation.oracle import known
 from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, run_named
 from active6d_core.metrics import DETECTION_FRACTION
-from active6d_sim.scenes.scene_store import SPLITS, load_scene
+from active6d_sim.scenes.scene_store import load_scene, stored_names
 from active6d_tools.studies.arguments import study_parser
 
 STEPS = 5
@@ -30,7 +30,7 @@ UPDATES, BATCH = 1500, 1024
 def read_split(name: str, split: str) -> tuple[SceneLookup, list[np.ndarray]]:
     """The bank of the stored scenes, and (M, n) what each view shows of each object of each scene."""
     bank = load_bank(find_bank(name, split))
-    stored = {f"{name}/{split}/{index}": index for index in range(SPLITS[split])}
+    stored = {scene: index for index, scene in enumerate(stored_names(name, split))}
     scenes = [scene for scene in bank.scenes if scene.name in stored]
     shown = [load_scene(name, split, stored[scene.name]).visible_fraction for scene in scenes]
     return make_lookup(replace(bank, scenes=scenes)), shown
