@@ -142,19 +142,23 @@ def fusion_methods_table(reports: Reports) -> str:
 
 
 def camera_errors_table(reports: Reports) -> str:
-    """Errors of the camera as rows, objects as columns: found, error and wrong, without and with aligned views."""
-
-    def cell(report: dict[str, Any], error: str) -> str:
-        own = {row["variant"]: row for row in report["rows"] if _camera_error(row) == error}
-        ends = own["not aligned"], own["aligned"]
-        parts = []
-        for key, digits, unit in (("found", 3, ""), ("e_add_mm", 1, " mm"), ("wrong", 3, " wrong")):
-            pair = ("-" if row[key] is None else number(row[key], digits) for row in ends)
-            parts.append(f"{' → '.join(pair)}{unit}")
-        return ", ".join(parts)
-
-    errors = list(dict.fromkeys(_camera_error(row) for report in reports.values() for row in report["rows"]))
-    return table(["", *reports], [[error, *(cell(report, error) for report in reports.values())] for error in errors])
+    """Objects and errors of the camera as rows; what is found and what is wrong, without and with aligned views."""
+    columns = {
+        "found_of_all": ("found", 3),
+        "found": ("found, confirmed", 3),
+        "e_add_mm": ("ADD, mm", 1),
+        "wrong": ("wrong of confirmed", 3),
+    }
+    rows = []
+    for name, report in reports.items():
+        for error in dict.fromkeys(_camera_error(row) for row in report["rows"]):
+            own = {row["variant"]: row for row in report["rows"] if _camera_error(row) == error}
+            cells = []
+            for key, (_, digits) in columns.items():
+                ends = (own[variant][key] for variant in ("not aligned", "aligned"))
+                cells.append(" → ".join("-" if value is None else number(value, digits) for value in ends))
+            rows.append([name, error, *cells])
+    return table(["", "camera's error", *(text for text, _ in columns.values())], rows)
 
 
 def _camera_error(row: dict[str, Any]) -> str:
