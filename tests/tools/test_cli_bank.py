@@ -91,11 +91,12 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
 def test_no_heap_is_in_two_splits():
     from active6d_sim.scenes.scene_store import FIRST_STORED_SEED
 
-    train, validation = (bank_building.scene_names("mug", split, None, 200) for split in ("train", "val"))
-    assert (len(train), len(validation)) == (224, 206)
+    train, validation = (bank_building.scene_names("mug", split, None, 200, 100) for split in ("train", "val"))
+    assert (len(train), len(validation)) == (324, 306)
     assert not set(train) & set(validation)
-    dropped = [int(name.split("/")[-1]) for name in train + validation if "/seed/" in name]
-    assert max(dropped) < FIRST_STORED_SEED
+    simulated = [int(name.split("/")[-1]) for name in train + validation if name.split("/")[1] in ("seed", "wild")]
+    assert len(simulated) == 600
+    assert max(simulated) < FIRST_STORED_SEED
 
 
 def test_a_scene_is_seen_as_the_graph_sees_it(monkeypatch):
@@ -120,6 +121,23 @@ def test_a_scene_is_seen_as_the_graph_sees_it(monkeypatch):
     np.testing.assert_allclose(own[:, :3], found.T_camera_object[:, :3, 3], atol=1e-6)
     np.testing.assert_allclose(own[:, 7], Verifier(model).score(view.depth, view.camera, found), atol=1e-6)
     np.testing.assert_allclose(own[:, 8], found.score, atol=1e-6)
+
+
+def test_a_wild_scene_is_simulated_by_its_seed(monkeypatch):
+    from active6d_core.view_sphere import ViewSphere
+    from active6d_sim.scenes.scene_store import load_scene
+
+    scene, asked = load_scene("bunny", "wild_val", 0), []
+
+    def simulate(model, seed, name):
+        asked.append((model.name, seed, name))
+        return scene
+
+    monkeypatch.setattr(bank_building, "wild_scene", simulate)
+    monkeypatch.setattr(bank_building, "ViewSphere", lambda: ViewSphere(elevations_degrees=(60.0,), azimuths=2))
+    made = bank_building.observe_scene_by_name("bunny/wild/50003", estimator="geometric", noise=1.0, seed=5)
+    assert asked == [("bunny", 50_003, "bunny/wild/50003")]
+    np.testing.assert_array_equal(made.T_world_object, scene.T_world_object)
 
 
 @pytest.fixture(scope="module")
@@ -323,6 +341,7 @@ def test_the_papers_policy_is_trained_in_full_and_begun_trainings_go_on(banks, t
         (["bank", "--estimator", "psychic"], "unknown estimator 'psychic'"),
         (["bank", "--object", "teapot"], "unknown object 'teapot'"),
         (["bank", "--split", "wild_test", "--heaps", "3"], "--heaps adds to the scenes of train, val, test"),
+        (["bank", "--split", "wild_val", "--wild", "3"], "--wild adds to the scenes of train, val, test"),
     ],
 )
 def test_bad_input_is_one_clear_line(banks, arguments, words):

@@ -19,33 +19,39 @@ from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import SPLITS, find_scene, load_scene, stored_names
+from active6d_sim.scenes.wild_scene import wild_scene
 
-#: Seeds of the piles beside a split's stored scenes start here. No stored scene and no pile that an estimator is
-#: trained on has such a seed.
+#: Seeds of the piles and wild scenes beside a split's stored scenes start here. No stored scene and no scene that an
+#: estimator is trained on has such a seed.
 FIRST_HEAP = {"train": 50_000, "val": 60_000, "test": 70_000}
 
 
-def scene_names(object_name: str, split: str, scenes: int | None, heaps: int = 0) -> list[str]:
-    """Names of scenes: stored scenes of the split, then piles that are simulated by their seed.
+def scene_names(object_name: str, split: str, scenes: int | None, heaps: int = 0, wild: int = 0) -> list[str]:
+    """Names of scenes: stored scenes of the split, then piles and wild scenes that are simulated by their seed.
 
     Args:
         object_name: of the objects in the scenes.
         split: of the stored scenes.
         scenes: number of stored scenes; None for all.
         heaps: number of simulated piles.
+        wild: number of simulated wild scenes.
 
     Raises:
         ValueError: an unknown object or split, piles for a split of wild scenes, or missing stored scenes.
     """
     if split not in SPLITS:
         raise ValueError(f"--split '{split}' is not among {', '.join(SPLITS)}")
-    if heaps and split not in FIRST_HEAP:
-        raise ValueError(f"--heaps adds to the scenes of {', '.join(FIRST_HEAP)}, not to split '{split}'")
+    for option, count in (("--heaps", heaps), ("--wild", wild)):
+        if count and split not in FIRST_HEAP:
+            raise ValueError(f"{option} adds to the scenes of {', '.join(FIRST_HEAP)}, not to split '{split}'")
     load_object(object_name)
     load_scene(object_name, split, 0)  # says how to make the stored scenes if they are missing
-    return stored_names(object_name, split, scenes) + [
-        f"{object_name}/seed/{FIRST_HEAP[split] + index}" for index in range(heaps)
+    simulated = [
+        f"{object_name}/{kind}/{FIRST_HEAP[split] + index}"
+        for kind, count in (("seed", heaps), ("wild", wild))
+        for index in range(count)
     ]
+    return stored_names(object_name, split, scenes) + simulated
 
 
 def bank_provenance(object_name: str, estimator: str, noise: float, seed: int) -> dict[str, Any]:
@@ -67,7 +73,10 @@ def observe_scene_by_name(
     """
     object_name, kind, number = name.split("/")
     model = load_object(object_name)
-    scene = find_scene(object_name, "", int(number)) if kind == "seed" else find_scene(object_name, name, 0)
+    if kind == "wild":
+        scene = wild_scene(model, int(number), name)
+    else:
+        scene = find_scene(object_name, "", int(number)) if kind == "seed" else find_scene(object_name, name, 0)
     simulator = Simulator(scene, noise=sensor_of(sensor, model, scene).scaled(noise), seed=seed)
     sphere, grid = ViewSphere(), SurfaceGrid.for_model(model)
     observed = observe_scene(

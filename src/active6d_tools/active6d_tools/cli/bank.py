@@ -15,7 +15,8 @@ def bank(
     split: Split = "test",
     estimator: Annotated[str, typer.Option(help="Estimator for each view: auto, {estimators}.")] = "auto",
     scenes: Annotated[int | None, typer.Option(min=1, help="Number of stored scenes; by default all.")] = None,
-    heaps: Annotated[int, typer.Option(min=0, help="Number of additional simulated piles; not for wild scenes.")] = 0,
+    heaps: Annotated[int, typer.Option(min=0, help="Number of additional simulated piles.")] = 0,
+    wild: Annotated[int, typer.Option(min=0, help="Number of additional simulated wild scenes.")] = 0,
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the noise of the simulated sensor.")] = 1.0,
     workers: Annotated[int, typer.Option(min=0, help="Number of processes; 0 for one per core.")] = 0,
     imports: Imports = None,
@@ -40,7 +41,7 @@ def bank(
     from active6d_tools.bank_building import bank_provenance, observe_scene_by_name, scene_names, summarise_bank
     from active6d_tools.threads import single_threaded
 
-    names = scene_names(object_name, split, scenes, heaps)
+    names = scene_names(object_name, split, scenes, heaps, wild)
     if estimator == AUTOMATIC:
         estimator = choose_estimator(object_name)
     create_estimator(estimator, load_object(object_name))  # refuses a wrong name or missing weights before any process
