@@ -161,6 +161,16 @@ def test_few_threads_are_one_line_before_a_library_needs_them():
     assert (ended.returncode, ended.stderr) == (1, f"{words} other programs\n")
 
 
+def test_few_open_files_are_one_line_before_a_command_begins():
+    few = "import resource, sys\nfrom active6d_tools import command\n"
+    few += "resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))\nsys.argv = ['active6d', 'list']\ncommand.main()"
+    ended = subprocess.run([sys.executable, "-c", few], stderr=subprocess.PIPE, text=True)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("active6d: cannot start: [Errno 24] Too many open files")
+    assert ended.stderr.endswith("; raise the limit (ulimit -n)\n")
+    assert ended.stderr.count("\n") == 1
+
+
 def modules(process):
     """A word that says that the command's own handler is in place: it ignores neither signal by default."""
     with open(f"/proc/{process}/status") as file:

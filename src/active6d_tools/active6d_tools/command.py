@@ -1,11 +1,13 @@
 """Entry point of the ``active6d`` command: what must happen before the slow imports."""
 
+import errno
 import os
 import signal
 import sys
 import threading
 from contextlib import suppress
 from types import FrameType
+from typing import NoReturn
 
 _WORD = b"active6d: interrupted\n"
 #: What the middleware, ray casting and torch start at most on a machine with few cores.
@@ -33,6 +35,10 @@ def main() -> None:
         code = end.code
         if code != INTERRUPTED and not INTERRUPTS.seen.is_set():
             raise
+    except OSError as error:  # a command reports its own; this is one before it began
+        if os.environ.get("ACTIVE6D_TRACEBACK") or "--debug" in sys.argv:
+            raise
+        _refuse(f"cannot start: {error}" + "; raise the limit (ulimit -n)" * (error.errno == errno.EMFILE))
     with suppress(OSError):
         sys.stdout.flush()
         sys.stderr.flush()
@@ -50,12 +56,16 @@ def _refuse_few_threads() -> None:
         for started in range(_THREADS):  # noqa: B007
             threading.Thread(target=done.wait, daemon=True).start()
     except RuntimeError:
-        with suppress(OSError):
-            os.write(2, b"active6d: only %d threads can be started, %d are needed; " % (started, _THREADS))
-            os.write(2, b"raise the limit of processes (ulimit -u), or end other programs\n")
-        os._exit(1)
+        few = f"only {started} threads can be started, {_THREADS} are needed"
+        _refuse(f"{few}; raise the limit of processes (ulimit -u), or end other programs")
     finally:
         done.set()
+
+
+def _refuse(text: str) -> NoReturn:
+    with suppress(OSError):
+        os.write(2, f"active6d: {text}\n".encode())
+    os._exit(1)
 
 
 def _end_at_once() -> None:
