@@ -18,6 +18,15 @@ def main() -> None:
     """Run the command. Ctrl-C ends it with exit code 130 at any time, while it imports or closes as well."""
     _end_at_once()
     _refuse_few_threads()
+    try:
+        _run()
+    except OSError as error:  # a command reports its own; this is one before it began
+        if os.environ.get("ACTIVE6D_TRACEBACK") or "--debug" in sys.argv:
+            raise
+        _refuse(f"cannot start: {error}" + "; raise the limit (ulimit -n)" * (error.errno == errno.EMFILE))
+
+
+def _run() -> None:
     from active6d_core.interrupts import INTERRUPTED, INTERRUPTS
 
     code: object = INTERRUPTED
@@ -35,10 +44,6 @@ def main() -> None:
         code = end.code
         if code != INTERRUPTED and not INTERRUPTS.seen.is_set():
             raise
-    except OSError as error:  # a command reports its own; this is one before it began
-        if os.environ.get("ACTIVE6D_TRACEBACK") or "--debug" in sys.argv:
-            raise
-        _refuse(f"cannot start: {error}" + "; raise the limit (ulimit -n)" * (error.errno == errno.EMFILE))
     with suppress(OSError):
         sys.stdout.flush()
         sys.stderr.flush()
