@@ -107,9 +107,10 @@ def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     try:
         yield pool
     except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
         for process in set(active_children()) - before:
             process.kill()
+        # Waits for the pool's own thread only. An interpreter that ends beside it may show a traceback.
+        pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
 

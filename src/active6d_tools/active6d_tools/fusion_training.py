@@ -1,14 +1,13 @@
 """Fits the weights of fusion: episodes on stored scenes with the deployed estimator, scored by the true poses."""
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 
+from active6d_core.interrupts import worker_pool
 from active6d_core.metrics import DETECTION_FRACTION, e_add
 from active6d_core.registry import AUTOMATIC
 from active6d_perception.scene.belief_training import LabelledPlaces, fit_belief, fit_probability, label_places
@@ -90,8 +89,7 @@ def _names(objects: Sequence[str], splits: Sequence[str], scenes: int | None) ->
 
 def _in_processes(work: Callable[[str], Any], names: Sequence[str], workers: int) -> Iterator[tuple[str, Any]]:
     """Results in the order of the names, so that they do not depend on the speed of the processes."""
-    # Spawned, because a forked child inherits locks of threads that do not exist in it (Embree, BLAS).
-    with ProcessPoolExecutor(max(1, min(workers, len(names))), mp_context=get_context("spawn")) as pool:
+    with worker_pool(max(1, min(workers, len(names)))) as pool:
         yield from zip(names, pool.map(work, names), strict=True)
 
 
