@@ -292,7 +292,7 @@ def test_missing_seeds_are_trained(banks, tmp_path, monkeypatch):
         own.mkdir(parents=True)
         (own / "curve.jsonl").write_text(json.dumps({"steps": 50_000}) + "\n" + json.dumps({"steps": steps}) + "\n")
     validation = BatchedFusion(load_bank(bank_path(banks, "mug", "val")))
-    found = ablate._train_seeds(LEARNED, validation, folder, 5, banks)
+    found = ablate._train_seeds(LEARNED, 3, validation, folder, 5, banks)
     assert found["attention", 1] == there
     every = [folder / name / f"seed{seed}" for name in ("view-attention", "attention") for seed in range(3)]
     assert [path for path, _, _ in asked] == [path for path in every if path != there.parent]
@@ -318,7 +318,7 @@ def test_the_papers_policy_is_trained_in_full_and_begun_trainings_go_on(banks, t
     begun.mkdir(parents=True)
     (begun / "latest.json").write_text("{}")
     validation = BatchedFusion(load_bank(bank_path(banks, "mug", "val")))
-    found = ablate._train_seeds(("attention-paper",), validation, tmp_path / "mug", 5, banks)
+    found = ablate._train_seeds(("attention-paper",), 3, validation, tmp_path / "mug", 5, banks)
     assert [(name, resume) for name, _, resume in asked] == [("seed0", False), ("seed1", True), ("seed2", False)]
     for _, parameters, _ in asked:
         assert (parameters.total, parameters.learning_rate) == (10_000_000, 1e-4)

@@ -53,9 +53,9 @@ def compare_seeds(
 
 
 def mark_best(rows: list[dict[str, Any]]) -> None:
-    """Set ``best_on_validation`` in rows of :func:`compare_seeds`: the best training of each policy."""
+    """Set ``best_on_validation`` in rows of :func:`compare_seeds`: the best of several trainings of a policy."""
     for policy in {row["policy"] for row in rows}:
         own = [row for row in rows if row["policy"] == policy]
         best = max(own, key=lambda row: (row["validation_detection_rate"], -row["validation_e_add_mm"]))
         for row in own:
-            row["best_on_validation"] = row is best
+            row["best_on_validation"] = row is best and len(own) > 1

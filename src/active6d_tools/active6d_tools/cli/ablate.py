@@ -48,8 +48,6 @@ class Part(StrEnum):
 _TRAINED = (Part.ALPHA, Part.ATTENTION, Part.SIGNS)
 #: Seed of the noise in the second bank of ``noise-resampling``.
 _AGAIN = 1
-#: Trainings of each learned policy that ``seeds`` and ``paper`` compare.
-_SEEDS = 3
 _OUT = "Folder of the trainings; by default in the cache folder."
 _POLICIES = "Policies that choose the views: {policies}; verification and fusion use only the first one."
 
@@ -62,6 +60,7 @@ def ablate(
     length: Annotated[
         int, typer.Option(min=1, help="Environment steps of each training (alpha, attention, signs).")
     ] = 200_000,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of trainings of each policy (seeds, paper).")] = 3,
     sample: Sample = 200,
     override: PolicyParameters = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help=_OUT)] = None,
@@ -78,8 +77,8 @@ def ablate(
     verification score against the estimator's score. [bold]fusion[/bold]: with clustering and without.
     [bold]signs[/bold]: signs of the reward, inverted and as the paper prints them. [bold]planning[/bold]: parameters
     of the default policy, without training. [bold]noise-resampling[/bold]: the same views with other sensor noise,
-    from a second bank (active6d bank --split test --seed 1). [bold]seeds[/bold]: three trainings of both learned
-    policies. [bold]paper[/bold]: three in the paper's length, for hours. Missing trainings start, begun ones go on.
+    from a second bank (active6d bank --split test --seed 1). [bold]seeds[/bold]: trainings of both learned
+    policies. [bold]paper[/bold]: trainings in the paper's length, for hours. Missing trainings start, begun ones go on.
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """
@@ -102,7 +101,7 @@ def ablate(
         rows = _train_variants(part, lookups, _folder(out, "ablations", object_name), steps, length, starts, seed)
     elif part in (Part.SEEDS, Part.PAPER):
         trained = LEARNED if part is Part.SEEDS else (PAPER,)
-        weights = _train_seeds(trained, lookups["val"], _folder(out, "policies", object_name), steps, banks)
+        weights = _train_seeds(trained, seeds, lookups["val"], _folder(out, "policies", object_name), steps, banks)
         rows = _compare_seeds(lookups, weights, starts, steps, sample, seed)
     else:
         rows = _evaluate_variants(part, lookups, names, starts, steps, seed, parameters)
@@ -201,7 +200,7 @@ def _compare_seeds(
 
 
 def _train_seeds(
-    policies: Sequence[str], validation: "SceneLookup", folder: Path, steps: int, banks: Path | None
+    policies: Sequence[str], seeds: int, validation: "SceneLookup", folder: Path, steps: int, banks: Path | None
 ) -> dict[tuple[str, int], Path]:
     """Weights of every policy and seed; missing ones are trained as by ``active6d train policy``, begun ones go on."""
     from active6d_agent.bank.joint_lookup import make_lookup
@@ -210,7 +209,7 @@ def _train_seeds(
 
     trainings = {}
     for name in policies:
-        for seed in range(_SEEDS):
+        for seed in range(seeds):
             own = folder / name / f"seed{seed}"
             begun = (own / "latest.json").is_file()
             trainings[name, seed] = plan_training(name, own, steps=steps, seed=seed, resume=begun)

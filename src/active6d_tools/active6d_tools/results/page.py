@@ -83,7 +83,7 @@ JOBS = {
         Job("attention", "ablate attention --sample 1000", trains=True),
         Job("signs", "ablate signs --sample 1000", trains=True),
         Job("seeds", "ablate seeds --sample 1000", trains=True),
-        Job("paper", "ablate paper --sample 1000", trains=True),
+        Job("paper", "ablate paper --seeds 1 --sample 1000", trains=True),
         Job("arm", "benchmark arm --episodes 20", draws=True),
         Job("environment", "benchmark environment", times=True),
         Job("pipeline", "benchmark pipeline", draws=True, times=True),

@@ -30,7 +30,7 @@ from active6d_agent.policies.registry import Observation
 from active6d_core.files import Checkpoints, append_line, atomic_file, make_folder, write_file
 
 #: The paper's length of the training and its learning rate (supplement E); batch and discount are the usual ones here.
-AS_IN_THE_PAPER = {"total": 10_000_000, "learning_rate": 1e-4}
+AS_IN_THE_PAPER = {"total": 10_000_000, "learning_rate": 1e-4, "evaluate_every": 200_000}
 
 
 @dataclass(frozen=True)
