@@ -1,17 +1,21 @@
 """Fitting fusion to scenes: which views are drawn, and what is learned from an episode."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hand_made_scenes import make_scene, three_mugs
 
+from active6d_agent.bank.joint_lookup import JointLookup
+from active6d_agent.bank.scene_bank import find_bank, load_bank
 from active6d_core.metrics import DETECTION_FRACTION, e_add
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.scene.belief_weights import BeliefWeights
+from active6d_perception.scene.belief_weights import BeliefWeights, belief_path, load_belief
 from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_tools import fusion_training
-from active6d_tools.fusion_training import count_scenes, describe_scene, fit_fusion, label_scene
+from active6d_tools.fusion_training import count_scenes, describe_scene, fit_fusion, label_scene, refit_probability
 from active6d_tools.processed_scene import ViewPool
 
 SPHERE = ViewSphere()
@@ -77,3 +81,46 @@ def test_weights_are_fitted_to_scenes(scene_folder, monkeypatch):
     model = load_object("mug")
     errors = e_add(model, objects.T_world_object[:, None], T_true).min(axis=0)
     assert (errors < DETECTION_FRACTION * model.diameter).sum() >= 2
+
+
+@pytest.fixture(scope="module")
+def bunny_bank():
+    bank = load_bank(find_bank("bunny", "test"))
+    return replace(bank, scenes=bank.scenes[:2])
+
+
+def test_only_the_probability_is_fitted_to_banks(bunny_bank, monkeypatch):
+    """The descriptions of the same views, scored by hand, are as probable as any near weights make them."""
+    monkeypatch.setattr(fusion_training, "_VIEWS", (3, 1))
+    weights = load_belief(belief_path("bunny"))
+    fitted, measured = refit_probability(weights, [bunny_bank], episodes=4, seed=5)
+    assert fitted.rotation is weights.rotation
+    assert fitted.body is weights.body
+    lookup, model, rows, right = JointLookup(bunny_bank, weights=weights), load_object("bunny"), [], []
+    for index, scene in enumerate(bunny_bank.scenes):
+        rng = np.random.default_rng([5, index])
+        for count in (3, 1, 3, 1):
+            views = rng.choice(100, count, replace=False)
+            objects = lookup.objects(index, views)
+            errors = e_add(model, objects.T_world_object[:, None], scene.T_world_object)
+            right.append((errors < DETECTION_FRACTION * model.diameter).any(axis=1))
+            rows.append(lookup.describe_fused(index, views)[0])
+    right = np.concatenate(right)
+    assert (measured["probability_scenes"], measured["fused_objects"]) == (2, len(right))
+    assert measured["right"] == pytest.approx(right.mean())
+
+    def loss(linear):
+        odds = np.concatenate(rows) @ linear
+        return (np.logaddexp(0, odds) - right * odds).mean() + 1e-3 * (linear**2).sum()
+
+    best = loss(fitted.probability.linear)
+    assert best < loss(weights.probability.linear)
+    for step in np.random.default_rng(0).normal(0, 0.1, (20, len(OBJECT_COLUMNS))):
+        assert best < loss(fitted.probability.linear + step)
+
+
+def test_scenes_of_the_belief_do_not_fit_the_probability(bunny_bank):
+    weights = load_belief(belief_path("bunny"))
+    learned = [replace(scene, name=f"bunny/train/{index}") for index, scene in enumerate(bunny_bank.scenes)]
+    with pytest.raises(ValueError, match="only scenes of the split train, to which the belief was fitted"):
+        refit_probability(weights, [replace(bunny_bank, scenes=learned)])

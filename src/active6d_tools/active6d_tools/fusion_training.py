@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from active6d_agent.bank.joint_lookup import JointLookup
+from active6d_agent.bank.scene_bank import SceneBank
 from active6d_core.interrupts import worker_pool
 from active6d_core.metrics import DETECTION_FRACTION, e_add
 from active6d_core.registry import AUTOMATIC
@@ -69,6 +71,45 @@ def fit_fusion(
     counts = {"belief_scenes": len(fitted), "probability_scenes": len(checked)}
     provenance = {"objects": list(objects), **common, **counts, **measured}
     return BeliefWeights(rotation, body, fit_probability(table[:, :-1], right), provenance), measured
+
+
+def refit_probability(
+    weights: BeliefWeights, banks: Sequence[SceneBank], *, episodes: int = 24, seed: int = 0
+) -> tuple[BeliefWeights, dict[str, Any]]:
+    """Fit only the probability, to scenes of banks that the belief was not fitted to.
+
+    Args:
+        weights: whose belief is kept.
+        banks: of one object, with evidence; scenes of the train split are left out.
+        episodes: per scene, of random views.
+        seed: of the views.
+
+    Returns:
+        The weights, and what was measured: numbers of scenes and of objects, and the share of right objects.
+
+    Raises:
+        ValueError: a bank has no evidence, or there is no other scene.
+    """
+    rows, right, names = [], [], []
+    for bank in banks:
+        lookup = JointLookup(bank, weights=weights)
+        for index, scene in enumerate(bank.scenes):
+            if scene.name.split("/")[1] == BELIEF_SPLIT:
+                continue
+            names.append(scene.name)
+            rng = np.random.default_rng([seed, int(scene.name.split("/")[-1])])
+            for episode in range(episodes):
+                views = rng.choice(len(lookup.sphere), _VIEWS[episode % len(_VIEWS)], replace=False)
+                described, found = lookup.describe_fused(index, views)
+                rows.append(described)
+                right.append(found)
+    if not names:
+        raise ValueError(f"the banks have only scenes of the split {BELIEF_SPLIT}, to which the belief was fitted")
+    correct = np.concatenate(right)
+    measured = {"probability_scenes": len(names), "fused_objects": len(correct), "right": float(correct.mean())}
+    provenance = {**weights.provenance, **measured, "probability_from": "banks", "probability_seed": seed}
+    probability = fit_probability(np.concatenate(rows), correct)
+    return replace(weights, probability=probability, provenance=provenance), measured
 
 
 def count_scenes(objects: Sequence[str], scenes: int | None) -> int:

@@ -177,6 +177,17 @@ class JointLookup(SceneLookup):
             pad("spread", 0.0),
         )
 
+    def describe_fused(self, scene: int, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Fuse (v,) different views of a scene, the camera being at the last one.
+
+        Returns:
+            (n, columns) descriptions of the n objects, see :data:`.OBJECT_COLUMNS`, and (n,) bool, which are right.
+        """
+        fused = fuse_episode(self.scenes[scene], np.sort(views), int(views[-1]), self._belief)
+        errors = self.errors[self.first_pose[scene] + fused.pose, : self.object_count[scene]]
+        right: np.ndarray = np.any(errors < DETECTION_FRACTION * self.model.diameter, axis=1)
+        return fused.description, right
+
     def _support(self, fused: FusedBatch) -> tuple[np.ndarray, np.ndarray]:
         assert isinstance(fused, JointBatch), "of another look-up"
         return fused.support, fused.spread

@@ -2,13 +2,16 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from active6d_tools.cli.options import Imports, JsonFile, ObjectName, Seed
 from active6d_tools.cli.output import write_json
 from active6d_tools.cli.terminal import console, messages, progress_bar
+
+if TYPE_CHECKING:
+    from active6d_perception.scene.belief_weights import BeliefWeights
 
 
 def fusion(
@@ -21,6 +24,12 @@ def fusion(
     export: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write the weights to this folder, as OBJECT_fusion.*.")
     ] = None,
+    bank_files: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--bank", metavar="FILE", help="Fit only the probability, to the scenes of this bank; repeatable."
+        ),
+    ] = None,
     workers: Annotated[int, typer.Option(min=0, help="Number of processes; 0 for one per core.")] = 0,
     imports: Imports = None,
     seed: Seed = 0,
@@ -29,11 +38,12 @@ def fusion(
     """Fit the weights by which fusion believes in poses, and the probability of an object.
 
     The belief is fitted to the scenes of the train split, the probability to those of val and wild_val. The name
-    "any" stands for all shipped objects; its weights serve objects without weights of their own.
+    "any" stands for all shipped objects; its weights serve objects without weights of their own. With --bank, the
+    belief stays as it is; scenes of the train split in the bank are left out.
 
     Example: [bold]active6d train fusion --object mug --export weights[/bold]
     """
-    from active6d_perception.scene.belief_weights import ANY_OBJECT, belief_file
+    from active6d_perception.scene.belief_weights import ANY_OBJECT
     from active6d_sim.scenes.scene_store import SHIPPED_SCENES
     from active6d_tools.fusion_training import count_scenes, fit_fusion
     from active6d_tools.threads import single_threaded
@@ -41,6 +51,10 @@ def fusion(
     names = [object_name]
     if object_name == ANY_OBJECT:
         names = sorted(folder.name for folder in SHIPPED_SCENES.iterdir() if folder.is_dir())
+    if bank_files:
+        weights, measured = _refit(object_name, bank_files, episodes, seed)
+        _finish(object_name, weights, measured, export, json_file, seed)
+        return
     with progress_bar() as progress, single_threaded():
         task = progress.add_task(object_name, total=count_scenes(names, scenes))
         weights, measured = fit_fusion(
@@ -52,6 +66,35 @@ def fusion(
             seed=seed,
             on_scene=lambda name: progress.update(task, advance=1, description=name),
         )
+    _finish(object_name, weights, measured, export, json_file, seed)
+
+
+def _refit(object_name: str, banks: list[Path], episodes: int, seed: int) -> tuple["BeliefWeights", dict[str, Any]]:
+    from active6d_agent.bank.scene_bank import load_bank
+    from active6d_core.object_model import load_object
+    from active6d_perception.scene.belief_weights import belief_path, load_belief
+    from active6d_tools.fusion_training import refit_probability
+
+    load_object(object_name)  # names the known ones
+    with messages.status("reading the banks"):
+        loaded = [load_bank(path) for path in banks]
+    for path, bank in zip(banks, loaded, strict=True):
+        if bank.object_name != object_name:
+            raise ValueError(f"{path}: is a bank of '{bank.object_name}', not of '{object_name}'")
+    with messages.status("fusing views of the banks"):
+        return refit_probability(load_belief(belief_path(object_name)), loaded, episodes=episodes, seed=seed)
+
+
+def _finish(
+    object_name: str,
+    weights: "BeliefWeights",
+    measured: dict[str, Any],
+    export: Path | None,
+    json_file: Path | None,
+    seed: int,
+) -> None:
+    from active6d_perception.scene.belief_weights import belief_file
+
     for key, value in measured.items():
         console.print(f"{key:24} {value:.3f}" if isinstance(value, float) else f"{key:24} {value}")
     if export is not None:
