@@ -98,11 +98,10 @@ def refit_probability(
                 continue
             names.append(scene.name)
             rng = np.random.default_rng([seed, int(scene.name.split("/")[-1])])
-            for episode in range(episodes):
-                views = rng.choice(len(lookup.sphere), _VIEWS[episode % len(_VIEWS)], replace=False)
-                described, found = lookup.describe_fused(index, views)
-                rows.append(described)
-                right.append(found)
+            draws = (rng.choice(len(lookup.sphere), _VIEWS[e % len(_VIEWS)], replace=False) for e in range(episodes))
+            described, found = zip(*(lookup.describe_fused(index, views) for views in draws), strict=True)
+            rows += described
+            right += found
     if not names:
         raise ValueError(f"the banks have only scenes of the split {BELIEF_SPLIT}, to which the belief was fitted")
     correct = np.concatenate(right)

@@ -15,7 +15,7 @@ from active6d_agent.bank.scene_bank import SceneBank
 from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.rollout import measure
 from active6d_agent.evaluation.oracle import worth
-from active6d_agent.evaluation.policy_evaluation import Intervals, Measures, describe, run_named
+from active6d_agent.evaluation.policy_evaluation import Intervals, Measures, describe, describe_ratio, run_named
 from active6d_core.view_sphere import ViewSphere
 
 
@@ -65,8 +65,7 @@ def ablate_noise_resampling(
 
     def row(name: str, noise: str, measures: Measures, first: Measures | None = None) -> dict[str, Any]:
         lead, gap = measures["detection_rate"] - low, high - low
-        shares = {f"gap_closed_{kind}": ends for kind, ends in intervals.of_ratio(lead, gap).items()}
-        gap_closed = {"gap_closed": float(lead.mean() / gap.mean()), **shares}
+        gap_closed = describe_ratio("gap_closed", lead, gap, intervals)
         variant = {"variant": f"{name}, {noise} noise", "policy": name, "noise": noise}
         return {**variant, **describe(measures, intervals, first), **gap_closed}
 

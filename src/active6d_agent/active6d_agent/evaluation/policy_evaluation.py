@@ -192,18 +192,19 @@ def describe(measures: Measures, intervals: Intervals, first: Measures | None = 
     row: dict[str, Any] = {}
     for name, values in measures.items():
         if name == "wrong":
-            row |= _share("wrong", values, measures["confirmed"], intervals)
+            row |= describe_ratio(name, values, measures["confirmed"], intervals)
             continue
         row[name] = float(values.mean())
         row |= {f"{name}_{kind}": interval for kind, interval in intervals.of(values).items()}
     return row if first is None else {**row, "against_first": compare(measures, first, intervals)}
 
 
-def _share(name: str, part: np.ndarray, whole: np.ndarray, intervals: Intervals) -> dict[str, Any]:
+def describe_ratio(name: str, part: np.ndarray, whole: np.ndarray, intervals: Intervals) -> dict[str, Any]:
+    """The mean of (E,) ``part`` over that of (E,) ``whole``, and its intervals (:func:`describe`); None without any."""
     if not whole.any():
         return {name: None}
-    both = intervals.of_ratio(part, whole)
-    return {name: float(part.sum() / whole.sum()), **{f"{name}_{kind}": interval for kind, interval in both.items()}}
+    both = {f"{name}_{kind}": interval for kind, interval in intervals.of_ratio(part, whole).items()}
+    return {name: float(part.mean() / whole.mean()), **both}
 
 
 def compare(own: Measures, other: Measures, intervals: Intervals) -> dict[str, dict[str, Any]]:

@@ -39,10 +39,28 @@ def fusion(
 
     The belief is fitted to the scenes of the train split, the probability to those of val and wild_val. The name
     "any" stands for all shipped objects; its weights serve objects without weights of their own. With --bank, the
-    belief stays as it is; scenes of the train split in the bank are left out.
+    belief stays as it is, scenes of the train split in the bank are left out, and --scenes, --estimator and --workers
+    have no effect.
 
     Example: [bold]active6d train fusion --object mug --export weights[/bold]
     """
+    from active6d_perception.scene.belief_weights import belief_file
+
+    if bank_files:
+        weights, measured = _refit(object_name, bank_files, episodes, seed)
+    else:
+        common: dict[str, Any] = {"episodes": episodes, "scenes": scenes, "estimator": estimator, "seed": seed}
+        weights, measured = _fit(object_name, workers or os.cpu_count() or 1, common)
+    for key, value in measured.items():
+        console.print(f"{key:24} {value:.3f}" if isinstance(value, float) else f"{key:24} {value}")
+    if export is not None:
+        path = export / belief_file(object_name)
+        weights.save(path, object_name)
+        messages.print(f"wrote {path}", highlight=False, markup=False)
+    write_json(json_file, {"object": object_name, "seed": seed, **measured})
+
+
+def _fit(object_name: str, workers: int, settings: dict[str, Any]) -> tuple["BeliefWeights", dict[str, Any]]:
     from active6d_perception.scene.belief_weights import ANY_OBJECT
     from active6d_sim.scenes.scene_store import SHIPPED_SCENES
     from active6d_tools.fusion_training import count_scenes, fit_fusion
@@ -51,22 +69,14 @@ def fusion(
     names = [object_name]
     if object_name == ANY_OBJECT:
         names = sorted(folder.name for folder in SHIPPED_SCENES.iterdir() if folder.is_dir())
-    if bank_files:
-        weights, measured = _refit(object_name, bank_files, episodes, seed)
-        _finish(object_name, weights, measured, export, json_file, seed)
-        return
     with progress_bar() as progress, single_threaded():
-        task = progress.add_task(object_name, total=count_scenes(names, scenes))
-        weights, measured = fit_fusion(
+        task = progress.add_task(object_name, total=count_scenes(names, settings["scenes"]))
+        return fit_fusion(
             names,
-            episodes=episodes,
-            scenes=scenes,
-            estimator=estimator,
-            workers=workers or os.cpu_count() or 1,
-            seed=seed,
+            workers=workers,
             on_scene=lambda name: progress.update(task, advance=1, description=name),
+            **settings,
         )
-    _finish(object_name, weights, measured, export, json_file, seed)
 
 
 def _refit(object_name: str, banks: list[Path], episodes: int, seed: int) -> tuple["BeliefWeights", dict[str, Any]]:
@@ -83,22 +93,3 @@ def _refit(object_name: str, banks: list[Path], episodes: int, seed: int) -> tup
             raise ValueError(f"{path}: is a bank of '{bank.object_name}', not of '{object_name}'")
     with messages.status("fusing views of the banks"):
         return refit_probability(load_belief(belief_path(object_name)), loaded, episodes=episodes, seed=seed)
-
-
-def _finish(
-    object_name: str,
-    weights: "BeliefWeights",
-    measured: dict[str, Any],
-    export: Path | None,
-    json_file: Path | None,
-    seed: int,
-) -> None:
-    from active6d_perception.scene.belief_weights import belief_file
-
-    for key, value in measured.items():
-        console.print(f"{key:24} {value:.3f}" if isinstance(value, float) else f"{key:24} {value}")
-    if export is not None:
-        path = export / belief_file(object_name)
-        weights.save(path, object_name)
-        messages.print(f"wrote {path}", highlight=False, markup=False)
-    write_json(json_file, {"object": object_name, "seed": seed, **measured})
