@@ -3,13 +3,18 @@
 import gc
 import os
 import signal
+import time
 import weakref
 
 import numpy as np
 import pytest
 import yaml
+from geometry_msgs.msg import PoseStamped
+from rclpy.context import Context
+from rclpy.node import Node
 from ros_harness import fresh_domain
 
+from active6d_agent.nodes import attention_policy
 from active6d_bringup.bags.reader import read_episode
 from active6d_bringup.bags.replay import ReplaySettings, replay
 from active6d_bringup.bags.writer import TYPESTORE, RecordingError
@@ -164,6 +169,29 @@ def test_when_every_goal_is_refused_the_episode_ends_and_says_why(tmp_path):
     expected = "no reachable view is left (3 refused by the camera, the last because: a wall is in the way)"
     assert result.reason == read_episode(tmp_path / "bag").end_reason == expected
     assert len(result.steps) == 1
+
+
+def test_a_goal_that_is_only_repeated_is_no_progress(monkeypatch):
+    """The camera refuses the goals of two policies, of which each repeats its own."""
+    monkeypatch.setattr(attention_policy, "_REPEAT_SECONDS", 0.2)
+    of_two = settings(overrides={"attention_policy": {"goal_timeout": 3.0}}, patience=1.0)
+    context = Context()
+    context.init(args=[], domain_id=of_two.domain)
+    other = Node("other_policy", context=context)
+    other.create_publisher(PoseStamped, "view_goal", 1)
+    try:
+        with pytest.raises(EpisodeError, match=r"no progress for 1 s.*view_goal: 2 nodes publish it: .*other_policy"):
+            run_episode(of_two, lambda step: _wait_for_discovery(other))
+    finally:
+        other.destroy_node()
+        context.try_shutdown()
+
+
+def _wait_for_discovery(other):
+    deadline = time.monotonic() + 10.0
+    while other.count_publishers("view_goal") < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.5)  # for the discovery in the other direction
 
 
 def test_what_a_node_refused_is_told(tmp_path):

@@ -15,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
 
 from active6d_bringup.bags.writer import RecordingError
@@ -317,11 +318,11 @@ class EpisodeMonitor(Node):
         super().__init__(
             "episode_monitor", context=context, namespace=namespace, start_parameter_services=False, enable_rosout=False
         )
-        self.received = 0
         self.end_stamp: int | None = None
         #: What a node last refused and why, in words; empty if none did.
         self.last_refusal: list[str] = []
         self._on_step = on_step
+        self._heard: set[tuple[str, bytes]] = set()
         self._reported: set[int] = set()
         self._poses: dict[int, np.ndarray] = {}
         self._objects: dict[int, SceneObjects] = {}
@@ -343,6 +344,11 @@ class EpisodeMonitor(Node):
         self._listen(topics.EPISODE_START, self._on_start)
         self._listen(topics.EPISODE_END, self._on_end)
         self._listen(topics.DIAGNOSTICS, self._on_diagnostics)
+
+    @property
+    def received(self) -> int:
+        """How many different messages came: a goal that is published again without an answer is no progress."""
+        return len(self._heard)
 
     @property
     def last(self) -> int:
@@ -383,7 +389,8 @@ class EpisodeMonitor(Node):
             except MessageError as error:
                 self.last_refusal = [f"the command refused {topic.name}: {error}"]
                 return
-            self.received += topic is not topics.DIAGNOSTICS
+            if topic is not topics.DIAGNOSTICS:
+                self._heard.add((topic.name, serialize_message(message)))
             self._report_steps()
 
         self.create_subscription(topic.message_type, topic.name, heard, qos_of(topic, 100))
