@@ -1,12 +1,17 @@
 """Ctrl-C ends a command within seconds whatever it does, with exit code 130, and leaves no process behind."""
 
+import multiprocessing
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import psutil
 import pytest
+
+from active6d_core.interrupts import worker_pool
 
 # A handler that does nothing stands for a library that swallows the exception.
 DEAF = """
@@ -176,3 +181,24 @@ def modules(process):
     with open(f"/proc/{process}/status") as file:
         caught = int(next(line for line in file if line.startswith("SigCgt")).split()[1], 16)
     return "command" if caught >> (signal.SIGTERM - 1) & 1 else ""
+
+
+def test_a_killed_worker_is_one_line_with_its_probable_cause():
+    with pytest.raises(ChildProcessError, match="most likely because memory ran out"), worker_pool(1) as pool:
+        pool.submit(os.kill, pool.submit(os.getpid).result(), signal.SIGKILL).result()
+
+
+def test_nothing_of_a_pool_is_left_after_an_exception():
+    before = set(threading.enumerate())
+    with pytest.raises(KeyError):
+        fail_beside_busy_workers()
+    assert set(threading.enumerate()) == before
+    assert not multiprocessing.active_children()
+
+
+def fail_beside_busy_workers():
+    with worker_pool(2) as pool:
+        jobs = [pool.submit(time.sleep, 100) for _ in range(4)]
+        while not jobs[0].running():
+            time.sleep(0.01)
+        raise KeyError

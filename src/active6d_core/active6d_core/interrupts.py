@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from multiprocessing import active_children, get_context
 from pathlib import Path
@@ -101,16 +102,22 @@ def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Processes that end with this one, however it ends, and at once when the block is left by an exception.
 
     They are spawned: a forked child inherits locks of threads that do not exist in it (Embree, BLAS).
+
+    Raises:
+        ChildProcessError: one of them was killed.
     """
     before = set(active_children())
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_follow, initargs=(os.getpid(),))
     try:
         yield pool
-    except BaseException:
+    except BaseException as error:
         for process in set(active_children()) - before:
             process.kill()
         # Waits for the pool's own thread only. An interpreter that ends beside it may show a traceback.
         pool.shutdown(cancel_futures=True)
+        if isinstance(error, BrokenProcessPool):
+            cause = "a worker process was killed, most likely because memory ran out; use fewer --workers"
+            raise ChildProcessError(cause) from error
         raise
     pool.shutdown()
 
