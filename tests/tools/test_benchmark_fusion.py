@@ -14,7 +14,7 @@ from active6d_perception.scene.measured_view import MeasuredView
 from active6d_sim.rendering.pose_error import PoseError
 from active6d_tools.benchmark.camera_errors import error_panels, measure_errors, parse_errors
 from active6d_tools.benchmark.fusion_methods import MethodResults, compare_methods
-from active6d_tools.processed_scene import ProcessedView, disturb
+from active6d_tools.processed_scene import ProcessedScene, ProcessedView, disturb
 
 
 def test_only_confirmed_objects_count_and_wrong_ones_are_told():
@@ -53,6 +53,16 @@ def test_methods_fuse_the_same_views(stored_mugs, monkeypatch):
         assert row["reported"] >= 3
         assert row["ms"] > 0
     assert results["ring"]["best-view"]["found"] >= 2 / 3
+
+
+@pytest.mark.slow
+def test_shapes_that_deviate_from_the_mesh_are_seen_and_not_known(stored_mugs):
+    exact, varied = ProcessedScene(stored_mugs), ProcessedScene(stored_mugs, vary_shapes=True)
+    assert varied.model is exact.model
+    np.testing.assert_array_equal(varied.scene.T_world_object, exact.scene.T_world_object)
+    depths = [processed.view(7).measured.depth for processed in (exact, varied)]
+    changes = np.abs(depths[0] - depths[1])[np.isfinite(depths[0]) & np.isfinite(depths[1])]
+    assert 0.0005 < np.quantile(changes, 0.99) < 0.2 * exact.model.diameter
 
 
 @pytest.mark.slow

@@ -19,12 +19,13 @@ from active6d_sim.rendering.pose_error import PoseError
 from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.simulator import NANOSECONDS, Simulator
 from active6d_sim.scenes.scene_store import find_scene
+from active6d_sim.scenes.shape_variation import vary_shape
 
 #: Views that a pool has on its ring.
 RING_VIEWS = 6
 _RING, _SAME = np.radians(45.0), np.radians(1.0)
-# Stream of the random numbers that draw the pool of a scene.
-_POOL_STREAM = 5
+# Streams of the random numbers that draw the pool of a scene and the shape of its objects.
+_POOL_STREAM, _SHAPE_STREAM = 5, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +65,7 @@ class ProcessedScene:
         estimator: name of the deployed one.
         pool: number of views that episodes share.
         seed: of the sensor's noise and of the pool.
+        vary_shapes: whether the objects, all alike, deviate from the mesh.
 
     Attributes:
         model: the object.
@@ -72,11 +74,18 @@ class ProcessedScene:
         pool: the views that episodes share.
     """
 
-    def __init__(self, name: str, estimator: str = AUTOMATIC, *, pool: int = 30, seed: int = 0) -> None:
+    def __init__(
+        self, name: str, estimator: str = AUTOMATIC, *, pool: int = 30, seed: int = 0, vary_shapes: bool = False
+    ) -> None:
         self.model, self.sphere = load_object(name.split("/")[0]), ViewSphere()
-        self.pool = ViewPool(self.sphere, pool, np.random.default_rng([_POOL_STREAM + seed, int(name.split("/")[-1])]))
+        index = int(name.split("/")[-1])
+        self.pool = ViewPool(self.sphere, pool, np.random.default_rng([_POOL_STREAM + seed, index]))
         self.scene = find_scene(self.model.name, name, 0)
-        self._simulator = Simulator(self.scene, noise=sensor_of(AUTOMATIC, self.model, self.scene), seed=seed)
+        seen = self.model
+        if vary_shapes:
+            seen = replace(seen, mesh=vary_shape(seen, np.random.default_rng([_SHAPE_STREAM + seed, self.scene.seed])))
+        sensor = sensor_of(AUTOMATIC, self.model, self.scene)
+        self._simulator = Simulator(self.scene, noise=sensor, seed=seed, model=seen)
         self._estimator, self._verifier = create_estimator(estimator, self.model), Verifier(self.model)
         self._views: dict[int, ProcessedView] = {}
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera, View
+from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import is_rigid
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.rendering.active_stereo import ActiveStereo
@@ -21,7 +22,12 @@ class Simulator:
     """An RGB-D camera that can take a view from any pose in a scene."""
 
     def __init__(
-        self, scene: Scene, camera: PinholeCamera = DEFAULT_CAMERA, noise: Sensor = ActiveStereo(), seed: int = 0
+        self,
+        scene: Scene,
+        camera: PinholeCamera = DEFAULT_CAMERA,
+        noise: Sensor = ActiveStereo(),
+        seed: int = 0,
+        model: ObjectModel | None = None,
     ) -> None:
         """
         Args:
@@ -29,9 +35,10 @@ class Simulator:
             camera: intrinsics of both images.
             noise: of the sensor.
             seed: seed of the sensor's noise and of the scene's appearance.
+            model: the objects as they look; those of the scene when None.
         """
         self.scene, self.camera, self.noise, self.seed = scene, camera, noise, seed
-        self.renderer = SceneRenderer(scene, appearance_seed=seed)
+        self.renderer = SceneRenderer(scene, model=model, appearance_seed=seed)
 
     def capture(self, T_world_camera: np.ndarray, stamp: int) -> View:
         """Take a view from (4, 4) ``T_world_camera``; its noise depends on seed and ``stamp`` (nanoseconds) only."""

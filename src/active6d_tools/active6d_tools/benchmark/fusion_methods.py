@@ -71,6 +71,7 @@ def compare_methods(
     episodes: int = 4,
     estimator: str = AUTOMATIC,
     seed: int = 0,
+    vary_shapes: bool = False,
     parameters: FusionParameters | None = None,
     on_progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> dict[str, dict[str, dict[str, float | None]]]:
@@ -82,6 +83,7 @@ def compare_methods(
         episodes: of six views of each kind in each scene; one of all views.
         estimator: name of the deployed one.
         seed: of the views and of the sensor's noise.
+        vary_shapes: whether the objects of each scene deviate from the mesh.
         parameters: of the fusion.
         on_progress: called with a scene's name, the number of scenes done and that of all.
 
@@ -92,7 +94,7 @@ def compare_methods(
     results: dict[str, dict[str, MethodResults]] = {kind: {} for kind in kinds}
     for done, name in enumerate(names):
         on_progress(name, done, len(names))
-        processed = ProcessedScene(name, estimator, seed=seed)
+        processed = ProcessedScene(name, estimator, seed=seed, vary_shapes=vary_shapes)
         methods: dict[str, SceneFusion | JointFusion] = {
             "best-view": SceneFusion(processed.model, parameters),
             "all-views": JointFusion(processed.model, parameters),

@@ -35,6 +35,9 @@ def fusion(
     confirmed: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Least probability of the objects that count.")
     ] = 0.5,
+    vary_shapes: Annotated[
+        bool, typer.Option("--vary-shapes", help="Let the objects deviate from their mesh, as real ones do.")
+    ] = False,
     estimator: Annotated[str, typer.Option(help="Estimator for each view: auto, {estimators}.")] = "auto",
     seed: Seed = 0,
     json_file: JsonFile = None,
@@ -51,7 +54,13 @@ def fusion(
     if unknown := set(chosen) - set(KINDS):
         raise ValueError(f"--kinds: '{min(unknown)}' is not among {', '.join(KINDS)}")
     names = scene_names(object_name, split, scenes)
-    settings: dict[str, Any] = {"kinds": chosen, "episodes": episodes, "estimator": estimator, "seed": seed}
+    settings: dict[str, Any] = {
+        "kinds": chosen,
+        "episodes": episodes,
+        "vary_shapes": vary_shapes,
+        "estimator": estimator,
+        "seed": seed,
+    }
     with work_progress() as on_progress:
         results = compare_methods(
             names,
