@@ -2,7 +2,9 @@ import errno
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from active6d_core.array_archive import read_archive, read_array
 from active6d_core.files import Checkpoints, append_line, atomic_file, cache_folder, make_folder, sha256_of, write_file
@@ -54,6 +56,13 @@ def test_everybody_may_read_a_written_file(tmp_path):
     (tmp_path / "plain").touch()
     assert (tmp_path / "picture.png").read_bytes() == b"\x89PNG"
     assert (tmp_path / "picture.png").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_everybody_may_read_what_a_library_writes_for_its_user_alone(tmp_path):
+    with atomic_file(tmp_path / "weights.safetensors") as unfinished:
+        save_file({"a": np.zeros(2)}, unfinished)
+    (tmp_path / "plain").touch()
+    assert (tmp_path / "weights.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):

@@ -90,7 +90,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
     with temporary as folder:
         unfinished = Path(folder) / path.name
         with naming(path):
+            unfinished.touch()
+            usual = unfinished.stat().st_mode
+            unfinished.unlink()
             yield unfinished
+            unfinished.chmod(usual)  # some writers let nobody else read what they write
         os.replace(unfinished, path)
 
 
