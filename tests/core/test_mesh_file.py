@@ -51,6 +51,29 @@ def test_a_sound_mesh_stays_as_it_is():
     np.testing.assert_array_equal(mesh.faces, BOX.faces)
 
 
+def with_normals(path):
+    corners = trimesh.Trimesh(BOX.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
+    corners.vertex_normals = np.repeat(BOX.face_normals, 3, axis=0)
+    corners.export(path, include_normals=True)
+
+
+def with_texture(path):
+    lines = [f"v {x} {y} {z}" for x, y, z in BOX.vertices]
+    lines += [f"vt {u} {v}" for u, v in np.random.default_rng(0).random((36, 2))]
+    for face, (a, b, c) in enumerate(BOX.faces + 1):
+        lines.append(f"f {a}/{3 * face + 1} {b}/{3 * face + 2} {c}/{3 * face + 3}")
+    path.write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize(("name", "write"), [("box.glb", with_normals), ("box.obj", with_texture)])
+def test_seams_of_normals_and_textures_are_no_holes(tmp_path, name, write):
+    write(tmp_path / name)
+    mesh = load_mesh(tmp_path / name)
+    assert close_mesh(mesh) == []
+    assert (len(mesh.vertices), len(mesh.faces)) == (8, 12)
+    assert mesh.volume == pytest.approx(BOX.volume, rel=1e-5)
+
+
 def test_what_was_done_is_said():
     assert close_mesh(open_box((0, 0, 1.0))) == ["holes closed with 2 faces"]
 

@@ -48,6 +48,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     check_counts(path.name, len(mesh.vertices), len(mesh.faces))
     if not np.isfinite(mesh.vertices).all():
         raise ValueError(f"mesh {path.name} has vertices that are not finite")
+    # Files repeat a vertex for every normal and every place in the texture, which leaves a closed mesh open.
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.remove_unreferenced_vertices()
     return mesh
 
