@@ -6,21 +6,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Transform, TransformStamped
 from sensor_msgs.msg import CameraInfo, Image
 from simulated_driver import FRAME, SECOND, TOPICS, SimulatedDriver, Traits, look, plane_view
 from std_srvs.srv import Trigger
 
 from active6d_bringup.nodes.camera_adapter import CameraAdapterNode
 from active6d_core.camera import PinholeCamera, View, backproject
-from active6d_core.ros import topics
+from active6d_core.ros import topics, transform_input
 from active6d_core.ros.conversions import (
     camera_to_info,
     image_to_color,
     image_to_depth,
     info_to_camera,
+    make_header,
     pose_to_transform,
     stamp_to_ns,
+    transform_to_pose,
     transform_to_pose_stamped,
 )
 from active6d_core.ros.episode_messages import GoalState, GoalStatus
@@ -284,3 +286,30 @@ def test_without_a_pose_topic_tf_is_needed(graph, monkeypatch):
     graph.add(node, start=False)
     with pytest.raises(ValueError, match="poses from /tf need tf2_msgs"):
         node.start()
+
+
+def test_images_that_come_before_the_transforms_do_not_keep_later_ones_away(graph, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    # A listener without a type is fed by take() alone.
+    monkeypatch.setattr(transform_input, "import_optional", lambda name: SimpleNamespace(TFMessage=None))
+    cell = Cell(graph, parameters={"pose_topic": ""})
+    cell.driver.run(40)
+    expected = f"images come, but no camera pose: no transform from world to {FRAME}"
+    graph.spin_until(lambda: expected in [d.status[0].message for d in cell.diagnostics])
+    listener = cell.adapter._transforms._source
+
+    for _ in range(40):
+        cell.driver.run(1)
+        header = make_header(cell.driver.stamp, "world")
+        stamped = TransformStamped(header=header, child_frame_id=FRAME, transform=transform_of(POSES[0]))
+        listener.take(SimpleNamespace(transforms=[stamped]), static=False)
+    graph.spin_until(lambda: all(cell.boxes))
+    np.testing.assert_allclose(pose_to_transform(cell.pose[0].pose), POSES[0], atol=1e-9)
+
+
+def transform_of(T):
+    pose, transform = transform_to_pose(T), Transform()
+    transform.rotation = pose.orientation
+    for axis in "xyz":
+        setattr(transform.translation, axis, getattr(pose.position, axis))
+    return transform

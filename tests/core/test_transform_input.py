@@ -85,6 +85,35 @@ def test_a_clock_that_goes_back_begins_again_and_old_transforms_are_forgotten(li
     assert len(found) == 1
 
 
+@pytest.mark.parametrize("clock", [0, 500 * SECOND])
+def test_the_clock_of_another_frame_does_not_matter(listener, clock):
+    found = []
+    for second in range(1, 40):
+        listener.take(message(flange(0, second * SECOND)), static=False)
+        listener.take(message([stamped(BASE, "map", "odom", clock)]), static=False)
+        listener.request("world", "camera_optical_frame", second * SECOND, found.append)
+    assert len(found) == 39
+
+
+def test_requests_of_a_time_before_the_first_transform_do_not_block_later_ones(listener):
+    early, late = [], []
+    for frame in range(200):
+        listener.request("world", "camera_optical_frame", SECOND + frame, early.append)
+    listener.take(message(flange(0, 5 * SECOND)), static=False)
+    listener.request("world", "camera_optical_frame", 5 * SECOND, late.append)
+    assert (len(early), len(late)) == (0, 1)
+
+
+def test_why_there_is_no_transform_is_said(listener):
+    assert (
+        listener.problem("world", "camera_optical_frame", SECOND) == "no transform from world to camera_optical_frame"
+    )
+    listener.take(message(flange(0, 5 * SECOND)), static=False)
+    expected = "the nearest transform of flange is 4000 ms from the image"
+    assert listener.problem("world", "camera_optical_frame", SECOND) == expected
+    assert listener.problem("world", "camera_optical_frame", 0) == ""
+
+
 def test_a_transform_that_is_not_rigid_is_refused(listener):
     bad = flange(0, SECOND)
     bad[0].transform.rotation.w = 3.0

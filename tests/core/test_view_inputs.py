@@ -15,6 +15,7 @@ from active6d_core.camera import PinholeCamera
 from active6d_core.ros.conversions import camera_to_info, ns_to_stamp, transform_to_pose, transform_to_pose_stamped
 from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
+from active6d_core.ros.transform_input import TransformInput
 from active6d_core.ros.view_inputs import ViewInputs
 from active6d_core.view_sphere import ViewSphere
 
@@ -51,6 +52,10 @@ class StubBuffer:
         self.waiting.append((key, future))
         self._settle()
         return future
+
+    def can_transform(self, target, source, time, return_debug_tuple):
+        assert return_debug_tuple
+        return False, "two trees"
 
     def lookup_transform(self, target, source, time):
         return self.transforms[target, source, time.nanoseconds]
@@ -109,6 +114,30 @@ def test_the_pose_comes_from_tf_before_or_after_its_view(graph, buffers):
     graph.spin_until(lambda: len(viewer.views) == 2)
     for (_, view), expected in zip(viewer.views, POSES, strict=False):
         np.testing.assert_allclose(view["pose"], expected, atol=1e-9)
+
+
+def test_a_view_without_transform_is_lost_with_its_cause(graph, buffers):
+    viewer = graph.add(Viewer(context=graph.context, overrides={"pose_source": "tf"}))
+    diagnostics = graph.mailbox(DiagnosticArray, "/diagnostics")
+    send_info(graph, SECOND)
+    graph.spin_until(lambda: buffers[0].waiting)
+    buffers[0].set(POSES[1], 2 * SECOND)
+    send_info(graph, 2 * SECOND)
+    text = "lost (1 so far): view of 1.000 s, no /tf came for it (two trees)"
+    graph.spin_until(lambda: text in [d.status[0].message for d in diagnostics])
+    assert [stamp for stamp, _ in viewer.views] == [2 * SECOND]
+
+
+def test_requests_that_wait_are_limited(graph, buffers):
+    node = graph.add(GraphNode("viewer", context=graph.context))
+    transforms, found = TransformInput(node), []
+    for stamp in range(1, 201):
+        transforms.request(stamp, found.append)
+    waiting = [key for key, future in buffers[0].waiting if not future.cancelled()]
+    assert [stamp for *_, stamp in waiting] == list(range(101, 201))
+    buffers[0].set(POSES[0], 1)
+    buffers[0].set(POSES[0], 101)
+    assert len(found) == 1
 
 
 def test_a_bad_transform_is_refused_and_the_node_lives(graph, buffers):

@@ -117,7 +117,7 @@ class CameraAdapterNode(GraphNode):
         self._infos: dict[str, Any] = {}
         self._goal_stamp: int | None = None
         self._goal: PoseStamped | None = None
-        self._begins, self._last_stamp, self._requests, self._unmatched, self._color_frame = True, -1, 0, 0, ""
+        self._begins, self._last_stamp, self._unmatched, self._color_frame = True, -1, 0, ""
 
     def awaited(self) -> Awaited:
         """The stream while a view is due, else the next goal."""
@@ -146,17 +146,12 @@ class CameraAdapterNode(GraphNode):
         if self._transforms is not None and self._asks_extrinsics:
             self._asks_extrinsics = False
             self._transforms.request(0, self._on_extrinsics, depth.header.frame_id, self._color_frame)
-        if self._transforms is not None and not self.value("pose_topic") and self._requests < _PENDING:
-            self._requests += 1
-            self._transforms.request(stamp, partial(self._on_transform, stamp), self._color_frame)
+        if self._transforms is not None and not self.value("pose_topic"):
+            self._transforms.request(stamp, partial(self._add_pose, stamp), self._color_frame)
         self._advance()
 
     def _on_extrinsics(self, T_color_depth: np.ndarray) -> None:
         self._T_color_depth = T_color_depth
-
-    def _on_transform(self, stamp: int, T_world_camera: np.ndarray) -> None:
-        self._requests -= 1
-        self._add_pose(stamp, T_world_camera)
 
     def _add_pose(self, stamp: int, T_world_camera: np.ndarray) -> None:
         self._poses.add(stamp, T_world_camera)
@@ -256,12 +251,19 @@ class CameraAdapterNode(GraphNode):
         if "info" not in self._infos:
             self.say_once(f"no camera_info comes on {self.value('info_topic')}: set info_topic")
         if self._poses.newest is None:
-            source = self.value("pose_topic") or f"the transform from {self.world_frame} to {self._color_frame}"
-            self.say_once(f"images come, but no camera pose: nothing on {source}")
+            self.say_once(f"images come, but no camera pose: {self._why_no_pose()}")
         else:
             window = round(self._limits.still_seconds * SECOND)
             recent = self._poses.between(self._poses.newest - window, self._poses.newest)
             self.say_once(check_pose_rate(len(recent), self._limits.still_seconds))
+
+    def _why_no_pose(self) -> str:
+        topic = self.value("pose_topic")
+        if topic or self._transforms is None:
+            return f"nothing on {topic}"
+        # There may be transforms, but none of the time of the images.
+        stamp = self._pending[-1][0] if self._pending else 0
+        return self._transforms.problem(0, self._color_frame) or self._transforms.problem(stamp, self._color_frame)
 
 
 def main() -> None:

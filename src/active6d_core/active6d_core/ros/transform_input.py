@@ -10,12 +10,14 @@ from geometry_msgs.msg import Pose
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 
-from active6d_core.ros.conversions import MessageError, pose_to_transform, stamp_to_ns
+from active6d_core.ros.conversions import MessageError, pose_to_transform
 from active6d_core.ros.node import GraphNode
 from active6d_core.ros.optional_outputs import import_optional
 from active6d_core.ros.transform_tree import TransformTree
 
-_KEPT_SECONDS, _MOST_REQUESTS, _MOST_MESSAGES = 10, 100, 100
+_KEPT = 10 * 10**9  # nanoseconds
+#: Requests that wait; a further one takes the place of the oldest, which may be of a time before the first transform.
+_MOST_REQUESTS, _MOST_MESSAGES = 100, 100
 _FOR_EVER = 2**62
 _Callback = Callable[[np.ndarray], None]
 
@@ -62,9 +64,13 @@ class TransformInput:
         """
         self._source.request(target or self._node.world_frame, source or self._node.camera_frame, stamp, callback)
 
+    def problem(self, stamp: int, source: str | None = None) -> str:
+        """Why /tf does not have the camera's pose at a stamp (ns; 0: at any time), in words; empty if it does."""
+        return self._source.problem(self._node.world_frame, source or self._node.camera_frame, stamp)
+
 
 class TransformListener:
-    """Listens to /tf and /tf_static without tf2_ros, keeps ten seconds, and interpolates.
+    """Listens to /tf and /tf_static without tf2_ros, keeps ten seconds of each frame, and interpolates.
 
     Args:
         node: the node that listens.
@@ -72,7 +78,7 @@ class TransformListener:
     """
 
     def __init__(self, node: GraphNode, message_type: Any = None) -> None:
-        self._node, self._tree, self._newest = node, TransformTree(), 0
+        self._node, self._tree = node, TransformTree(_KEPT)
         self._waiting: deque[tuple[str, str, int, _Callback]] = deque(maxlen=_MOST_REQUESTS)
         if message_type is None:
             return
@@ -92,15 +98,7 @@ class TransformListener:
         Raises:
             MessageError: a transform is not rigid.
         """
-        stamps = [stamp_to_ns(each.header.stamp) for each in message.transforms]
-        if not static and stamps and max(stamps) < self._newest - _KEPT_SECONDS * 10**9:
-            # The clock went back, as when a bag begins again.
-            self._tree.forget_moving()
-            self._newest = 0
         self._tree.add(message, static)
-        if not static:
-            self._newest = max([self._newest, *stamps])
-            self._tree.forget_before(self._newest - _KEPT_SECONDS * 10**9)
         waiting, self._waiting = self._waiting, deque(maxlen=_MOST_REQUESTS)
         for request in waiting:
             self.request(*request)
@@ -108,11 +106,22 @@ class TransformListener:
     def request(self, target: str, source: str, stamp: int, callback: _Callback) -> None:
         """As :meth:`TransformInput.request`."""
         try:
-            found = self._tree.lookup(target, source, stamp or _FOR_EVER, None if stamp else _FOR_EVER)
+            found = self._look_up(target, source, stamp)
         except MessageError:
             self._waiting.append((target, source, stamp, callback))
             return
         self._node.guard("/tf", lambda: callback(found))
+
+    def problem(self, target: str, source: str, stamp: int) -> str:
+        """Why there is no transform between two frames, see :meth:`TransformInput.problem`."""
+        try:
+            self._look_up(target, source, stamp)
+        except MessageError as error:
+            return str(error)
+        return ""
+
+    def _look_up(self, target: str, source: str, stamp: int) -> np.ndarray:
+        return self._tree.lookup(target, source, stamp or _FOR_EVER, None if stamp else _FOR_EVER)
 
 
 class _Tf2Source:
@@ -121,16 +130,28 @@ class _Tf2Source:
     def __init__(self, node: GraphNode, tf2_ros: Any) -> None:
         self._node, self._buffer = node, tf2_ros.Buffer(node=node)
         self._listener = tf2_ros.TransformListener(self._buffer, node)
+        self._waiting: deque[Any] = deque()
 
     def request(self, target: str, source: str, stamp: int, callback: _Callback) -> None:
         """As :meth:`TransformInput.request`."""
         time = Time(nanoseconds=stamp)
 
         def take() -> None:
+            if future not in self._waiting:
+                return  # it gave its place to another one
+            self._waiting.remove(future)
             found = self._buffer.lookup_transform(target, source, time).transform
             pose = Pose(orientation=found.rotation)
             pose.position.x, pose.position.y, pose.position.z = (getattr(found.translation, axis) for axis in "xyz")
             callback(pose_to_transform(pose))
 
         future = self._buffer.wait_for_transform_async(target, source, time)
+        self._waiting.append(future)
+        if len(self._waiting) > _MOST_REQUESTS:
+            self._waiting.popleft().cancel()
         future.add_done_callback(lambda done: self._node.guard("/tf", take))
+
+    def problem(self, target: str, source: str, stamp: int) -> str:
+        """As :meth:`TransformListener.problem`."""
+        _, text = self._buffer.can_transform(target, source, Time(nanoseconds=stamp), return_debug_tuple=True)
+        return str(text)

@@ -14,9 +14,15 @@ _LARGEST_TREE = 1000
 
 
 class TransformTree:
-    """The frames that transforms connect; each has one parent."""
+    """The frames that transforms connect; each has one parent.
 
-    def __init__(self) -> None:
+    Args:
+        kept: nanoseconds before the newest transform of a moving frame of which its transforms are kept; None for all.
+            A frame whose stamps go back by more begins again, as when a bag is played from its beginning.
+    """
+
+    def __init__(self, kept: int | None = None) -> None:
+        self._kept = kept
         self._parents: dict[str, str] = {}
         self._stamps: dict[str, list[int]] = defaultdict(list)
         self._transforms: dict[str, list[np.ndarray]] = defaultdict(list)
@@ -33,9 +39,23 @@ class TransformTree:
             self._parents[child] = parent
             if static:
                 self._static.add(child)
-            position = bisect_left(self._stamps[child], stamp := stamp_to_ns(each.header.stamp))
-            self._stamps[child].insert(position, stamp)
-            self._transforms[child].insert(position, transform_from_quaternion(numbers[3:], numbers[:3]))
+            self._insert(child, stamp_to_ns(each.header.stamp), transform_from_quaternion(numbers[3:], numbers[:3]))
+
+    def _insert(self, child: str, stamp: int, T_parent_child: np.ndarray) -> None:
+        stamps, transforms = self._stamps[child], self._transforms[child]
+        limited = self._kept is not None and child not in self._static
+        if limited and stamps and stamp < stamps[-1] - self._kept:
+            stamps.clear()
+            transforms.clear()
+        position = bisect_left(stamps, stamp)
+        if stamps[position : position + 1] == [stamp]:
+            transforms[position] = T_parent_child
+            return
+        stamps.insert(position, stamp)
+        transforms.insert(position, T_parent_child)
+        if limited:
+            old = bisect_left(stamps, stamps[-1] - self._kept)
+            del stamps[:old], transforms[:old]
 
     def root(self, frame: str) -> str:
         """The frame at the root of a frame's tree."""
@@ -72,18 +92,6 @@ class TransformTree:
             chain.append(self._parents[chain[-1]])
         return chain
 
-    def forget_before(self, stamp: int) -> None:
-        """Forget the transforms before a stamp (ns), but for the last ones of each frame and the static ones."""
-        for child, stamps in self._stamps.items():
-            first = min(bisect_left(stamps, stamp), len(stamps) - 1)
-            if child not in self._static and first > 0:
-                del stamps[:first], self._transforms[child][:first]
-
-    def forget_moving(self) -> None:
-        """Forget all transforms but the static ones."""
-        for child in set(self._stamps) - self._static:
-            del self._stamps[child], self._transforms[child], self._parents[child]
-
     def _compose(self, chain: list[str], stamp: int, tolerance: int | None) -> np.ndarray:
         T = np.eye(4)
         for child in chain:
@@ -92,8 +100,10 @@ class TransformTree:
 
     def _at(self, child: str, stamp: int, tolerance: int | None) -> np.ndarray:
         stamps, transforms = self._stamps[child], self._transforms[child]
-        nearest = min(range(len(stamps)), key=lambda index: abs(stamps[index] - stamp))
-        late, after = abs(stamps[nearest] - stamp), bisect_left(stamps, stamp)
+        after = bisect_left(stamps, stamp)
+        around = range(max(after - 1, 0), min(after + 1, len(stamps)))
+        nearest = min(around, key=lambda index: abs(stamps[index] - stamp))
+        late = abs(stamps[nearest] - stamp)
         if child in self._static or late <= (tolerance or 0):
             return transforms[nearest]
         if tolerance is not None or after in (0, len(stamps)):

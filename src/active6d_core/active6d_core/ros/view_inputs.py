@@ -206,7 +206,8 @@ class ViewInputs:
 
     def _on_loss(self, stamp: int, absent: list[str]) -> None:
         topics = ", ".join(self._topics[part] for part in absent)
-        self._node.lose(f"view of {stamp * 1e-9:.3f} s, no {topics} came for it")
+        why = self._transforms.problem(stamp) if self._transforms is not None and "pose" in absent else ""
+        self._node.lose(f"view of {stamp * 1e-9:.3f} s, no {topics} came for it{why and f' ({why})'}")
 
     def _on_complete(self, stamp: int, values: dict[str, Any]) -> None:
         self._latest = stamp
