@@ -101,6 +101,8 @@ def test_depth_outside_the_range_is_invalid():
     assert limit_depth(nothing) is nothing
     with pytest.raises(ValueError, match="median is 750 m; it looks like millimetres"):
         limit_depth(np.full((2, 2), 750.0, np.float32))
+    with pytest.raises(ValueError, match=r"within 0.05 to 1 m, the median is 1.5 m; check the range and the unit"):
+        limit_depth(np.full((2, 2), 1.5, np.float32), (0.05, 1.0))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (15, 480), (5000, 480), (4000, 3000)])
@@ -140,6 +142,15 @@ def test_a_camera_info_is_used_or_refused(change, cause):
         setattr(info, name, value)
     with pytest.raises(MessageError, match=cause):
         info_to_camera(info)
+
+
+@pytest.mark.parametrize("centre", [(-20.5, 23.5), (31.5, 70.0), (90.0, -3.0)])
+def test_a_camera_info_may_be_of_a_part_of_a_larger_image(centre):
+    part = replace(CAMERA, cx=centre[0], cy=centre[1])
+    info = camera_to_info(part, 1, "camera")
+    assert 0 < info.k[2] < info.width
+    assert 0 < info.k[5] < info.height
+    assert info_to_camera(info) == part
 
 
 def test_a_camera_info_may_leave_out_what_it_does_not_need():

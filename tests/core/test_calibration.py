@@ -30,6 +30,13 @@ def test_a_calibration_of_another_size_is_refused():
         Calibration(160, 120, K).rectified_camera()
 
 
+def test_a_region_may_be_beside_the_centre():
+    camera = Calibration(640, 480, K, region=(400, 0, 200, 480)).rectified_camera()
+    assert (camera.width, camera.cx) == (200, K[0, 2] - 400)
+    with pytest.raises(ValueError, match="another image size"):
+        Calibration(640, 480, K - [[0, 0, 5000], [0, 0, 0], [0, 0, 0]], region=(400, 0, 200, 480)).rectified_camera()
+
+
 def test_region_and_binning_move_every_ray_with_its_pixel():
     """A pixel of the image sees what the same place of the full resolution sees."""
     calibration = Calibration(640, 480, K, binning=(2, 2), region=(100, 60, 400, 300))

@@ -133,3 +133,12 @@ def test_objects_are_found_on_the_path_and_unknown_ones_listed(tmp_path, monkeyp
     assert load_object("found_here").instances == (1, 3)
     with pytest.raises(ValueError, match=r"unknown object 'lost'.*found_here"):
         load_object("lost")
+
+
+@pytest.mark.parametrize("diameter", [0.003, 0.0069, 0.04, 0.4])
+def test_the_usual_bin_of_any_object_has_room_for_it(tmp_path, diameter):
+    trimesh.creation.box(np.full(3, diameter / np.sqrt(3))).export(tmp_path / "part.ply")
+    (tmp_path / "part.yaml").write_text("name: part\nmesh: part.ply\ninstances: [1, 1]\ncolor: [0.5, 0.5, 0.5]\n")
+    model = read_description(tmp_path / "part.yaml")
+    assert diameter < model.bin_width < 1.5 * diameter
+    assert 0 < model.wall_height < diameter

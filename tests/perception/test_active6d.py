@@ -57,6 +57,17 @@ def test_what_cannot_be_meant_is_refused(estimate, images, change, cause):
         estimate(*change(*images))
 
 
+def test_the_distance_that_counts_is_within_the_range(estimate, images):
+    rgb, depth, K = images
+    behind = np.full((480, 1280), 18.0, np.float32)
+    wide = np.where(np.arange(1280) < 640, np.pad(depth, ((0, 0), (0, 640))), behind)
+    picture = np.pad(rgb, ((0, 0), (0, 640), (0, 0)))
+    wide[: len(wide) // 4] = 18.0  # most of the image
+    with pytest.raises(ValueError, match="would span"):
+        estimate(picture, wide, K)
+    assert len(estimate(picture, wide, K, depth_range=(0.3, 1.5)))
+
+
 def test_range_leaves_only_what_is_inside(estimate, images):
     rgb, depth, K = images
     far = float(np.nanquantile(depth, 0.4))

@@ -149,7 +149,10 @@ def test_bad_camera_keys_are_named(folder, key, value):
     ("name", "change", "message"),
     [
         ("scene_camera.json", lambda c: c["2"].pop("cam_R_w2c"), r"scene_camera\.json: image 2: no key cam_R_w2c"),
-        ("scene_camera.json", lambda c: c["0"].update(cam_K=[0.0] * 9), "image 0: cam_K: camera focal lengths"),
+        ("scene_camera.json", lambda c: c["0"].update(cam_K=[0.0] * 9), "image 0: cam_K: K must be"),
+        ("scene_camera.json", lambda c: c["0"].update(cam_K=[55, 0, 0, 0, 55, 0, 30, 24, 1]), "is it transposed"),
+        ("scene_camera.json", lambda c: c["0"].update(cam_K=[1, 0, 0, 0, 1, 0, 0, 0, 1]), "impossible for 64x48"),
+        ("scene_camera.json", lambda c: c["0"].update(cam_K=[55, 0, 900, 0, 55, 24, 0, 0, 1]), "outside the 64x48"),
         ("scene_camera.json", lambda c: c["0"].update(depth_scale=0), "depth_scale must be positive"),
         ("scene_camera.json", lambda c: c["0"].update(cam_R_w2c=[1, 0, 0, 0, 1, 0, 0, 0, -1]), "cam_R_w2c is not a"),
         ("scene_camera.json", lambda c: c["0"].update(cam_t_w2c=[0, 0, 0]), "cam_t_w2c puts the camera at"),
@@ -168,6 +171,18 @@ def test_broken_entries_are_named(folder, name, change, message):
     spoil(folder, name, change)
     with pytest.raises(ValueError, match=message):
         BopScene.load(folder)
+
+
+def test_a_part_of_a_larger_image_is_read(folder):
+    spoil(folder, "scene_camera.json", lambda c: c["0"].update(cam_K=[55, 0, 90, 0, 55, 24, 0, 0, 1]))
+    assert BopScene.load(folder).cameras[0].cx == 90
+
+
+def test_a_world_at_the_first_camera_is_read_where_no_poses_are_needed(folder):
+    spoil(folder, "scene_camera.json", lambda c: c["0"].update(cam_t_w2c=[0, 0, 0]))
+    with pytest.raises(ValueError, match="puts the camera at"):
+        BopScene.load(folder)
+    assert len(BopScene.load(folder, needs_poses=False)) == len(EYES)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\udcff", "[" * 100_000])

@@ -58,7 +58,11 @@ def limit_depth(depth: np.ndarray, depth_range: tuple[float, float] = PLAUSIBLE_
     limited = np.where(outside, np.float32(np.nan), depth)
     if np.isnan(limited).all():
         median = float(np.median(depth[outside]))
-        cause = "it looks like millimetres in a floating-point image" if median > high else "check its unit"
+        nearest, farthest = PLAUSIBLE_DEPTH
+        as_millimetres = median > farthest and nearest <= 1e-3 * median <= farthest
+        cause = (
+            "it looks like millimetres in a floating-point image" if as_millimetres else "check the range and the unit"
+        )
         raise ValueError(f"no depth is within {low:g} to {high:g} m, the median is {median:.4g} m; {cause}")
     return limited
 

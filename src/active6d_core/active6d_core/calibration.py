@@ -120,4 +120,4 @@ class Calibration:
             matrix = self.K
         else:
             raise ValueError("neither P nor K holds focal lengths; calibrate the camera")
-        return PinholeCamera.from_matrix(self.in_image(matrix), *self.image_size)
+        return PinholeCamera.from_matrix(self.in_image(matrix), *self.image_size, cropped=any(self.region))

@@ -7,6 +7,8 @@ import numpy as np
 
 # Focal lengths over the longer side of the image: from fields of view of 136 degrees to those of 3 degrees.
 _FOCAL_LENGTHS = (0.2, 20.0)
+# How far the centre of a larger image may be beside the part of it, in widths and heights of the part.
+_CROPPED = 2
 _SAME_SURFACE = 0.02  # relative difference of depth
 
 
@@ -42,8 +44,14 @@ class PinholeCamera:
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     @classmethod
-    def from_matrix(cls, matrix: np.ndarray, width: int, height: int) -> "PinholeCamera":
+    def from_matrix(cls, matrix: np.ndarray, width: int, height: int, *, cropped: bool = False) -> "PinholeCamera":
         """The camera of a (3, 3) intrinsic matrix K in pixels, for images of ``width`` x ``height`` pixels.
+
+        Args:
+            matrix: K.
+            width: of the image.
+            height: of the image.
+            cropped: whether the image may be part of a larger one, whose centre need not be in it.
 
         Raises:
             ValueError: K is not an intrinsic matrix without skew, or does not belong to images of this size.
@@ -61,10 +69,13 @@ class PinholeCamera:
                 f"K has focal lengths {camera.fx:g} and {camera.fy:g} pixels, impossible for {width}x{height} images; "
                 "is K the identity, in millimetres, or of another image size?"
             )
-        if not (0 < camera.cx < width and 0 < camera.cy < height):
+        beside = _CROPPED if cropped else 0
+        if not all(
+            -beside * side < centre < (1 + beside) * side for centre, side in ((camera.cx, width), (camera.cy, height))
+        ):
             raise ValueError(
-                f"K has its centre at ({camera.cx:g}, {camera.cy:g}), outside the {width}x{height} image; "
-                "is K of another image size?"
+                f"K has its centre at ({camera.cx:g}, {camera.cy:g}), outside the {width}x{height} image; is K of "
+                "another image size? If the image is part of a larger one, give a PinholeCamera in place of K"
             )
         return camera
 

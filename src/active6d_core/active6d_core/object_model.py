@@ -30,6 +30,8 @@ ALLOW_OUTSIDE_VARIABLE = "ACTIVE6D_ALLOW_OUTSIDE"
 _MOST_INSTANCES, _MOST_PROFILE_ROWS, _MOST_FEATURES = 200, 1000, 100
 # Cells along the longest side, for the search of the two vertices that are farthest apart.
 _DIAMETER_CELLS = 16
+# Least side of a bin, diameters of the object.
+_LEAST_BIN = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,8 @@ class ObjectModel:
         It is 0.625 diameters times the root of that number. Then objects hide each other, but the heap is neither too
         high nor larger than the default camera's image (measured in ``docs/scenes.md``).
         """
-        return round(0.625 * self.diameter * float(np.sqrt(np.mean(self.instances))), 2)
+        width = max(0.625 * float(np.sqrt(np.mean(self.instances))), _LEAST_BIN) * self.diameter
+        return round(width, 2 if width >= 0.1 else 4)
 
     @property
     def wall_height(self) -> float:

@@ -75,12 +75,12 @@ class Active6D:
         """
         kind = None if sensor is None else depth_camera(sensor)
         view = make_view(rgb, depth, camera, depth_scale=depth_scale, T_world_camera=T_world_camera)
-        check_span(self.model, view.depth, view.camera)
         if kind is not None:
             depth_range = depth_range or kind.depth_range
             if kind.flying_pixels:
                 view = replace(view, depth=without_flying_pixels(view.depth))
         view = crop_depth(view, depth_range, region, region_in_world=T_world_camera is not None)
+        check_span(self.model, view.depth, view.camera)
         return self._estimator.estimate(view).ranked()
 
 

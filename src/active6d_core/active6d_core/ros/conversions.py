@@ -5,6 +5,7 @@ Everything that comes in is checked here (sizes, encodings, frames, numbers, qua
 message objects that rosbags deserialises.
 """
 
+import math
 import re
 from array import array
 from collections.abc import Iterator, Sequence
@@ -16,7 +17,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion, Vector3
-from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2, PointField, RegionOfInterest
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -300,14 +301,25 @@ def joints_to_state(names: Sequence[str], joints: np.ndarray, stamp: int) -> Joi
 
 
 def camera_to_info(camera: PinholeCamera, stamp: int, frame: str) -> CameraInfo:
-    """Intrinsics of a rectified camera to a CameraInfo."""
-    info = CameraInfo(header=make_header(stamp, frame), height=camera.height, width=camera.width)
+    """Intrinsics of a rectified camera to a CameraInfo; an image beside its centre is a region of a larger one."""
+    x, width = _whole_side(camera.cx, camera.width)
+    y, height = _whole_side(camera.cy, camera.height)
+    info = CameraInfo(header=make_header(stamp, frame), height=height, width=width)
+    if (width, height) != (camera.width, camera.height):
+        info.roi = RegionOfInterest(x_offset=x, y_offset=y, width=camera.width, height=camera.height)
     info.distortion_model = "plumb_bob"
     info.d = [0.0] * 5
-    info.k = camera.matrix.ravel()
+    matrix = camera.matrix + [[0, 0, x], [0, 0, y], [0, 0, 0]]
+    info.k = matrix.ravel()
     info.r = np.eye(3).ravel()
-    info.p = np.hstack([camera.matrix, np.zeros((3, 1))]).ravel()
+    info.p = np.hstack([matrix, np.zeros((3, 1))]).ravel()
     return info
+
+
+def _whole_side(centre: float, side: int) -> tuple[int, int]:
+    """Offset of an image in the smallest one around it that has the centre within it, and that one's side, pixels."""
+    offset = max(0, math.floor(-centre) + 1)
+    return offset, max(offset + side, math.floor(offset + centre) + 1)
 
 
 def info_to_camera(message: CameraInfo) -> PinholeCamera:

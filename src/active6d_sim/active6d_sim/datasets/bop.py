@@ -93,7 +93,7 @@ class BopScene:
             k = _numbers(entry, "cam_K", 9, path, image)
             size = _size(_image_path(folder, "depth", image))
             try:
-                cameras.append(PinholeCamera(*size, k[0], k[4], k[2], k[5]))
+                cameras.append(PinholeCamera.from_matrix(k.reshape(3, 3), *size, cropped=True))
             except ValueError as error:
                 raise ValueError(f"{path}: image {image}: cam_K: {error}") from error
             color = _image_path(folder, "rgb", image)
@@ -274,7 +274,7 @@ def _read_camera_pose(entry: Any, path: Path, image: int, needed: bool) -> np.nd
     if not needed and isinstance(entry, dict) and not entry.keys() & {"cam_R_w2c", "cam_t_w2c"}:
         return np.eye(4)
     T_world_camera = invert(_read_pose(entry, "cam_R_w2c", "cam_t_w2c", path, image))
-    if not np.linalg.norm(T_world_camera[:3, 3]) > 1e-6:
+    if needed and not np.linalg.norm(T_world_camera[:3, 3]) > 1e-6:
         raise ValueError(f"{path}: image {image}: cam_t_w2c puts the camera at the world's origin")
     return T_world_camera
 

@@ -135,7 +135,8 @@ class CameraSimulatorNode(MovingCameraNode):
     def _load_next(self) -> None:
         scene = self._simulator.scene
         if not self.value("scene"):
-            self._load("", scene.seed + 1)
+            self.seed = scene.seed + 1  # all is as in an episode of that seed
+            self._load("", self.seed)
             return
         split, index = scene.name.split("/")[-2:]
         self._load(f"{split}/{(int(index) + 1) % SPLITS[split]}", self.seed)
