@@ -90,9 +90,9 @@ def evidence_of_views(scene, index, views):
     own, neighbour = np.nonzero((place[:, None] != place[heads]) & (apart < BESIDE * ambiguity.diameter))
     parts = (np.eye(4)[None], ambiguity.body_points), (ambiguity.rotations, ambiguity.telling_points)
     tray = JointFusion(load_object("mug"))._tray
-    container = [against_container(T, *part, tray) for part in parts]
+    container = [against_container(T, *part, tray, 1.0) for part in parts]
     among = [
-        combine_neighbours(against_neighbour(T[own], T[heads][neighbour], *part, ambiguity.solid), own, len(T))
+        combine_neighbours(against_neighbour(T[own], T[heads][neighbour], *part, ambiguity.solid, 1.0), own, len(T))
         for part in parts
     ]
     body, twin, telling = (

@@ -55,7 +55,7 @@ AHEAD = make_transform(np.eye(3), [0.0, 0.0, 0.5])[None]
 
 
 def count(view, T=AHEAD, rotations=IDENTITY):
-    counted = cases.count_cases(T, rotations, np.zeros(3), 0.05, PATCH, view)
+    counted = cases.count_cases(T, rotations, np.zeros(3), 0.05, PATCH, view, 1.0)
     return counted.reshape(len(T), len(rotations), cases.WHAT, cases.WHOSE)
 
 
@@ -104,7 +104,7 @@ def test_a_handle_fits_where_it_is_and_is_looked_through_elsewhere(render):
     hypotheses = Hypotheses.from_masks(T[None], np.ones(1), np.ones(1), segmentation, floor)
     view = measure_view(floor, CAMERA, np.eye(4), hypotheses, ambiguity)
     counted = cases.count_cases(
-        T[None], ambiguity.rotations, ambiguity.middle, 0.03, ambiguity.telling_samples, view
+        T[None], ambiguity.rotations, ambiguity.middle, 0.03, ambiguity.telling_samples, view, 1.0
     ).reshape(-1, cases.WHAT, cases.WHOSE)
     fitting, through = counted[:, cases.FITTING, 0], counted[:, cases.LOOKED_THROUGH, 2]
     assert fitting.argmax() == 0
@@ -146,13 +146,15 @@ def test_container_columns_of_a_stick():
     """Eleven points along z from 0 to 10 cm, upright, 2 cm below the floor and 1 cm beyond the wall."""
     stick = np.column_stack([np.zeros(11), np.zeros(11), np.linspace(0, 0.1, 11)])
     T = make_transform(np.eye(3), [[0.0, 0.0, -0.02], [0.11, 0.0, 0.0]])
-    found = against_container(T, IDENTITY, stick, Tray(0.2, 0.055))[:, 0]
+    found = against_container(T, IDENTITY, stick, Tray(0.2, 0.055), 1.0)[:, 0]
     np.testing.assert_allclose(found[0], [2 / 11, -0.02, 0, -0.1, 0.03], atol=1e-9)
     # Six of the points are below the top of the wall.
     np.testing.assert_allclose(found[1], [0, 0, 6 / 11, 0.01, 0.05], atol=1e-9)
-    open_table = against_container(T, IDENTITY, stick, OPEN_TABLE)[:, 0]
+    open_table = against_container(T, IDENTITY, stick, OPEN_TABLE, 1.0)[:, 0]
     np.testing.assert_allclose(open_table[:, 2:4], [[0, -1], [0, -1]])
-    np.testing.assert_array_equal(against_container(T, IDENTITY, np.zeros((0, 3)), OPEN_TABLE), np.zeros((2, 1, 5)))
+    np.testing.assert_array_equal(
+        against_container(T, IDENTITY, np.zeros((0, 3)), OPEN_TABLE, 1.0), np.zeros((2, 1, 5))
+    )
 
 
 def test_neighbour_columns_are_those_of_a_ball(ball):
@@ -164,7 +166,7 @@ def test_neighbour_columns_are_those_of_a_ball(ball):
         make_transform(Rotation.random(rng=rng).as_matrix(), [[x, 0.0, 0.1], [x + 5.0, 0.0, 0.1]]) for x in (0.0, 0.03)
     )
     T[1, 0, 3] = 0.0
-    found = against_neighbour(T, N, rotations, points, solid)
+    found = against_neighbour(T, N, rotations, points, solid, 1.0)
     for r, rotation in enumerate(rotations):
         local = transform_points(invert(N[0]) @ T[0] @ rotation, points)
         distance = np.linalg.norm(local, axis=1) - 0.04
@@ -172,7 +174,7 @@ def test_neighbour_columns_are_those_of_a_ball(ball):
         if distance.min() < 0.004:
             assert found[0, r, 1] == pytest.approx(distance.min(), abs=2e-3)
     np.testing.assert_array_equal(found[1], [[0.0, FREE]] * 2)
-    nothing = against_neighbour(T, N, rotations, np.zeros((0, 3)), solid)
+    nothing = against_neighbour(T, N, rotations, np.zeros((0, 3)), solid, 1.0)
     np.testing.assert_array_equal(nothing, np.broadcast_to([0.0, FREE], (2, 2, 2)))
 
 

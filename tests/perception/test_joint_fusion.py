@@ -100,6 +100,36 @@ def test_all_views_together_know_the_handles(mug, episode):
     np.testing.assert_array_equal(objects.support, [4, 4])
 
 
+@pytest.mark.parametrize("scale", [0.5, 1.4])
+def test_an_object_of_another_size_is_judged_like_one_of_usual_size(mug, episode, scale):
+    mesh = mug.mesh.copy().apply_scale(scale)
+    features = {name: scale * box for name, box in mug.features.items()}
+    other = replace(mug, mesh=mesh, diameter=scale * mug.diameter, features=features, origin=scale * mug.origin)
+    views = [resize(view, scale) for view in episode]
+    expected, found = objects_of(fuse(mug, episode), episode[-1]), objects_of(fuse(other, views), views[-1])
+    assert ambiguity_of(mug).scale == 1
+    assert e_add(mug, resized(found.T_world_object, 1 / scale)[:, None], TRUE).min(axis=0).max() < 1e-3
+    np.testing.assert_allclose(found.probability, expected.probability, atol=0.02)
+    np.testing.assert_allclose(found.entropy, expected.entropy, atol=0.1)
+
+
+def resized(T, scale):
+    moved = T.copy()
+    moved[..., :3, 3] *= scale
+    return moved
+
+
+def resize(view, scale):
+    """The same images of a world that is larger or smaller."""
+    stamp, T_world_camera, hypotheses, verification, depth, camera = view
+    other = replace(
+        hypotheses,
+        T_camera_object=resized(hypotheses.T_camera_object, scale),
+        depth=scale * hypotheses.depth,
+    )
+    return stamp, resized(T_world_camera, scale), other, verification, np.float32(scale) * depth, camera
+
+
 def test_no_hypothesis_needs_to_have_the_right_handle(mug, episode):
     guessed = [view for view in episode if view is not episode[2]]
     before = np.concatenate([T_world_camera @ h.T_camera_object for _, T_world_camera, h, *_ in guessed])
@@ -150,7 +180,7 @@ def test_another_view_computes_its_own_part_only(mug, episode, monkeypatch):
     counted, count_cases = [], joint_fusion.count_cases
 
     def count(T, *rest):
-        counted.append((len(T), rest[-1]))
+        counted.append((len(T), rest[-2]))
         return count_cases(T, *rest)
 
     monkeypatch.setattr(joint_fusion, "count_cases", count)

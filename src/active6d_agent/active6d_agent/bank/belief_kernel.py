@@ -69,6 +69,7 @@ class Belief(NamedTuple):
     within: np.ndarray
     """(r, r) bool, rotations that are right if another one is"""
     diameter: float
+    """of the object, metres divided by :attr:`.Ambiguity.scale`"""
     cut: float
     """hypotheses nearer than this to a body stand for it, metres"""
     exclusion: float

@@ -58,9 +58,10 @@ def evidence_of(scene: BankScene) -> EvidenceTables:
 
 def make_belief(model: ObjectModel, weights: BeliefWeights, parameters: FusionParameters) -> Belief:
     """What the kernel needs beside the evidence."""
-    errors, tolerance = ambiguity_of(model).rotation_errors, DETECTION_FRACTION * model.diameter
+    ambiguity, tolerance = ambiguity_of(model), DETECTION_FRACTION * model.diameter
+    errors = ambiguity.rotation_errors
     similar = np.maximum(0.0, 1.0 - (errors / tolerance) ** 2)
-    lengths = model.diameter, parameters.cut * model.diameter, parameters.exclusion * model.diameter
+    lengths = model.diameter / ambiguity.scale, parameters.cut * model.diameter, parameters.exclusion * model.diameter
     return Belief.of(weights, similar, errors < tolerance, *lengths, parameters.least_probability)
 
 
@@ -109,9 +110,10 @@ def _feasibility(
     near = np.linalg.norm(middles[:, None] - middles, axis=-1) < BESIDE * ambiguity.diameter
     own, neighbour = np.nonzero(other & near)
     parts = (same, ambiguity.body_points), (ambiguity.rotations, ambiguity.telling_points)
-    container, turned = (against_container(T, rotations, points, tray) for rotations, points in parts)
+    container, turned = (against_container(T, rotations, points, tray, ambiguity.scale) for rotations, points in parts)
     pairs, turned_pairs = (
-        against_neighbour(T[own], T[neighbour], rotations, points, ambiguity.solid) for rotations, points in parts
+        against_neighbour(T[own], T[neighbour], rotations, points, ambiguity.solid, ambiguity.scale)
+        for rotations, points in parts
     )
     first = np.searchsorted(own, np.arange(len(T) + 1))
     return container[:, 0], turned, first, neighbour, np.ascontiguousarray(pairs), turned_pairs

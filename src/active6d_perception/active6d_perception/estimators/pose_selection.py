@@ -22,6 +22,7 @@ from active6d_perception.estimators.pose_evidence import (
     weigh_poses,
 )
 from active6d_perception.estimators.score_model import ScoreModel
+from active6d_perception.model.length_scale import length_scale
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.outline import outline_of
 from active6d_perception.model.surface_grid import SurfaceGrid, surface_grid
@@ -33,18 +34,10 @@ FEATURES = (*EVIDENCE, "fitting_comparable", "violated_comparable", "near_compar
 #: Weights of the features.
 SELECTION_FILE = Path(__file__).parent / "pose_selection.json"
 
-# Tolerances are for objects of this diameter. They scale with the object, within what depth sensors resolve.
-_REFERENCE_DIAMETER = 0.14  # metres
-_SCALES = (0.35, 1.5)
 _TOLERANCE = 0.006  # metres
 _ALIKE = 0.7
 _BEYOND = 0.03  # diameters
 _SAMPLES = 256
-
-
-def length_scale(model: ObjectModel) -> float:
-    """The factor on lengths that are given for an object of 0.14 m."""
-    return float(np.clip(model.diameter / _REFERENCE_DIAMETER, *_SCALES))
 
 
 def judge_of(

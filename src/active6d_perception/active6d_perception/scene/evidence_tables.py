@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from active6d_perception.scene.body_refinement import refine_poses
-from active6d_perception.scene.joint_fusion import OWN_PLACE, WHOLE_GATES, JointFusion
+from active6d_perception.scene.joint_fusion import OWN_PLACE, WHOLE_GATES, JointFusion, scaled_gates
 from active6d_perception.scene.measured_cases import CASES, count_cases
 
 # Whole objects are refined with about as many views: an episode has few, and there are many poses.
@@ -78,7 +78,7 @@ def tabulate(fusion: JointFusion) -> EvidenceTables:
     T, count = candidates.T_world_object, len(ambiguity.rotations)
     turned = (T[:, None] @ ambiguity.rotations).reshape(-1, 4, 4)
     few = views[:: max(1, len(views) // _REFINING_VIEWS)]
-    whole = refine_poses(turned, ambiguity.all_samples, few, WHOLE_GATES, search=False)
+    whole = refine_poses(turned, ambiguity.all_samples, few, scaled_gates(WHOLE_GATES, ambiguity.scale), search=False)
     same = np.eye(4)[None]
     parts = {
         "body": (same, ambiguity.body_samples),
@@ -90,7 +90,7 @@ def tabulate(fusion: JointFusion) -> EvidenceTables:
     for name, (rotations, samples) in parts.items():
         for row, view in zip(roots[name], views, strict=True):
             if samples.number.any():
-                counts = count_cases(T, rotations, ambiguity.middle, near, samples, view)
+                counts = count_cases(T, rotations, ambiguity.middle, near, samples, view, ambiguity.scale)
                 row[:] = np.minimum(np.rint(np.sqrt(counts)), 255)
     return EvidenceTables(
         T,

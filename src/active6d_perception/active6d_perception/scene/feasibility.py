@@ -19,7 +19,9 @@ FREE = 0.05
 
 
 @compiled
-def against_container(T_world_object: np.ndarray, rotations: np.ndarray, points: np.ndarray, tray: Tray) -> np.ndarray:
+def against_container(
+    T_world_object: np.ndarray, rotations: np.ndarray, points: np.ndarray, tray: Tray, scale: float
+) -> np.ndarray:
     """Compare points of an object with the floor and the walls around it.
 
     Args:
@@ -27,10 +29,11 @@ def against_container(T_world_object: np.ndarray, rotations: np.ndarray, points:
         rotations: (r, 4, 4) ``T_object_rotated``.
         points: (p, 3) object frame, metres.
         tray: the walls; the floor is at z = 0.
+        scale: factor on lengths, see :func:`.fusion_scale`.
 
     Returns:
-        (k, r, 5) of :data:`CONTAINER_COLUMNS`, metres. A point is below or beyond by more than 3 mm; the farthest is
-        negative inside. All are 0 without points.
+        (k, r, 5) of :data:`CONTAINER_COLUMNS`, metres divided by ``scale``. A point is below or beyond by more than
+        3 mm of these; the farthest is negative inside. All are 0 without points.
     """
     result = np.zeros((len(T_world_object), len(rotations), 5))
     half, count = 0.5 * tray.width, len(points)
@@ -44,11 +47,11 @@ def against_container(T_world_object: np.ndarray, rotations: np.ndarray, points:
                 y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
                 z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
                 beyond = max(abs(x), abs(y)) - half if z < tray.wall_height else -1.0
-                row[0] += z < -_INTO_CONTAINER
-                row[1] = min(row[1], z)
-                row[2] += beyond > _INTO_CONTAINER
-                row[3] = max(row[3], beyond)
-                row[4] += z
+                row[0] += z < -scale * _INTO_CONTAINER
+                row[1] = min(row[1], z / scale)
+                row[2] += beyond > scale * _INTO_CONTAINER
+                row[3] = max(row[3], beyond / scale)
+                row[4] += z / scale
             for column in (0, 2, 4):
                 row[column] /= max(count, 1)
     return result
@@ -56,7 +59,12 @@ def against_container(T_world_object: np.ndarray, rotations: np.ndarray, points:
 
 @compiled
 def against_neighbour(
-    T_world_object: np.ndarray, T_world_neighbour: np.ndarray, rotations: np.ndarray, points: np.ndarray, solid: Solid
+    T_world_object: np.ndarray,
+    T_world_neighbour: np.ndarray,
+    rotations: np.ndarray,
+    points: np.ndarray,
+    solid: Solid,
+    scale: float,
 ) -> np.ndarray:
     """Compare points of each object with the solid of one neighbour.
 
@@ -66,14 +74,15 @@ def against_neighbour(
         rotations: (r, 4, 4) ``T_object_rotated`` of the object.
         points: (p, 3) object frame, metres.
         solid: of the neighbour.
+        scale: factor on lengths, see :func:`.fusion_scale`.
 
     Returns:
         (k, r, 2): the share of the points more than 1.5 mm inside of the neighbour, and the least signed distance from
-        it, metres; those farther than 5 mm may be given as 50 mm.
+        it; those farther than 5 mm may be given as 50 mm. These are metres divided by ``scale``.
     """
     result = np.zeros((len(T_world_object), len(rotations), 2))
     result[:, :, 1] = FREE
-    reach = solid.reach + _NEAR
+    reach = solid.reach + scale * _NEAR
     middle, radius = _ball_around(points)
     local = np.empty(points.shape)
     for k in range(len(T_world_object)):
@@ -92,8 +101,8 @@ def against_neighbour(
                     local[p, axis] = T[axis, 0] * a + T[axis, 1] * b + T[axis, 2] * c + T[axis, 3]
             distances = signed_distances(local, solid)
             for p in range(len(points)):
-                result[k, r, 0] += distances[p] < -_INTO_NEIGHBOUR
-                result[k, r, 1] = min(result[k, r, 1], distances[p])
+                result[k, r, 0] += distances[p] < -scale * _INTO_NEIGHBOUR
+                result[k, r, 1] = min(result[k, r, 1], distances[p] / scale)
             result[k, r, 0] /= max(len(points), 1)
     return result
 

@@ -108,8 +108,13 @@ class JointFusion:
         self.weights = weights or load_belief(belief_path(model.name))
         self._tray = tray or Tray.for_model(model)
         self._known = HypothesisTable(self.ambiguity.body_distance.between)
-        self._bodies = BodyRefinement(self.ambiguity.body_samples, _BODY_GATES, _BODY_LATTICE)
-        self._whole = BodyRefinement(self.ambiguity.all_samples, WHOLE_GATES, _WHOLE_LATTICE, search=False)
+        scale = self.ambiguity.scale
+        self._bodies = BodyRefinement(
+            self.ambiguity.body_samples, scaled_gates(_BODY_GATES, scale), scale * _BODY_LATTICE
+        )
+        self._whole = BodyRefinement(
+            self.ambiguity.all_samples, scaled_gates(WHOLE_GATES, scale), scale * _WHOLE_LATTICE, search=False
+        )
         self.reset()
         self._compile()
 
@@ -182,7 +187,7 @@ class JointFusion:
         whole = _Part("body", same, ambiguity.body_points, ambiguity.body_samples)
         twins = _Part("twin", same, ambiguity.body_points, ambiguity.twin_samples)
         candidates = self.candidates()
-        heads = _rounded(candidates.take(candidates.heads()))
+        heads = self._rounded(candidates.take(candidates.heads()))
         bodies = BodyEvidence(
             candidates,
             self._count(candidates, whole)[:, 0],
@@ -198,7 +203,7 @@ class JointFusion:
             self._count(candidates, telling),
             self._in_container(candidates, telling),
             self._among_neighbours(candidates, heads, telling),
-            ambiguity.diameter,
+            ambiguity.diameter / ambiguity.scale,
         )
         self._feasible.sweep()
         self._sums.sweep()
@@ -230,26 +235,32 @@ class JointFusion:
         refined = self._bodies.refine(found.T_world_object, self._all_views())
         return merge_duplicates(replace(found, T_world_object=refined), ambiguity)
 
+    def _rounded(self, candidates: BodyCandidates) -> tuple[np.ndarray, list[bytes]]:
+        """(K, 4, 4) poses at which evidence is taken, and their keys."""
+        return round_poses(candidates.T_world_object, candidates.T_world_start, self.ambiguity.scale * _LATTICE)
+
     def _count(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:
         """(K, r, CASES) counts of a part over all views."""
         ambiguity = self.ambiguity
-        rounded, keys = _rounded(candidates)
+        rounded, keys = self._rounded(candidates)
         none = np.zeros((len(part.rotations), CASES), np.int64)
         if not part.samples.number.any():
             return np.tile(none, (len(keys), 1, 1))
 
         def compute(missing: np.ndarray, view: MeasuredView) -> np.ndarray:
             place = OWN_PLACE * ambiguity.diameter
-            return count_cases(rounded[missing], part.rotations, ambiguity.middle, place, part.samples, view)
+            return count_cases(
+                rounded[missing], part.rotations, ambiguity.middle, place, part.samples, view, ambiguity.scale
+            )
 
         return self._all_views().sums([(part.name, key) for key in keys], compute, none)
 
     def _in_container(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:
         """(K, r, 5), see :func:`.against_container`."""
-        rounded, keys = _rounded(candidates)
+        rounded, keys = self._rounded(candidates)
 
         def compute(missing: np.ndarray) -> np.ndarray:
-            return against_container(rounded[missing], part.rotations, part.points, self._tray)
+            return against_container(rounded[missing], part.rotations, part.points, self._tray, self.ambiguity.scale)
 
         return self._feasible.rows([(part.name, key) for key in keys], compute)
 
@@ -258,7 +269,7 @@ class JointFusion:
     ) -> np.ndarray:
         """(K, r, 2) overlap with the most evident bodies of other places, given as rounded poses and their keys."""
         ambiguity, solid = self.ambiguity, self.ambiguity.solid
-        rounded, keys = _rounded(candidates)
+        rounded, keys = self._rounded(candidates)
         middles, others = (transform_points(T, ambiguity.middle[None])[:, 0] for T in (rounded, heads[0]))
         apart = np.linalg.norm(middles[:, None] - others, axis=-1)
         other = candidates.place[:, None] != np.arange(len(others))
@@ -266,7 +277,7 @@ class JointFusion:
 
         def compute(missing: np.ndarray) -> np.ndarray:
             pair = rounded[own[missing]], heads[0][neighbour[missing]]
-            return against_neighbour(*pair, part.rotations, part.points, solid)
+            return against_neighbour(*pair, part.rotations, part.points, solid, ambiguity.scale)
 
         pairs = [(part.name, keys[a], heads[1][b]) for a, b in zip(own, neighbour, strict=True)]
         return combine_neighbours(self._feasible.rows(pairs, compute), own, len(keys))
@@ -348,6 +359,6 @@ class JointFusion:
         return self.describe(stamp, T_world_camera, camera).objects
 
 
-def _rounded(candidates: BodyCandidates) -> tuple[np.ndarray, list[bytes]]:
-    """(K, 4, 4) poses at which evidence is taken, and their keys."""
-    return round_poses(candidates.T_world_object, candidates.T_world_start, _LATTICE)
+def scaled_gates(gates: tuple[float, ...], scale: float) -> tuple[float, ...]:
+    """The gates of refinement, metres, for an object of another size."""
+    return tuple(scale * gate for gate in gates)

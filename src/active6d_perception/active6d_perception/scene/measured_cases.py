@@ -33,6 +33,7 @@ def count_cases(
     same_place: float,
     samples: VisibleSamples,
     view: MeasuredView,
+    scale: float,
 ) -> np.ndarray:
     """Count the pixels that the visible samples of each pose and rotation cover, by case.
 
@@ -43,6 +44,7 @@ def count_cases(
         same_place: an instance whose body's middle is nearer than this to the pose's is the pose's own, metres.
         samples: of the part of the surface to look at.
         view: what was measured.
+        scale: factor on the distances at which the surface counts as measured.
 
     Returns:
         (k, r, :data:`CASES`) int32 sixteenths of a pixel; the case is ``what * WHOSE + whose``.
@@ -57,7 +59,7 @@ def count_cases(
                 there = T[axis, 0] * middle[0] + T[axis, 1] * middle[1] + T[axis, 2] * middle[2] + T[axis, 3]
                 square += (view.middles[index, axis] - there) ** 2
             own[index] = square < same_place * same_place
-        _count_body(view.T_camera_world @ T, rotations, own, samples, view, counts[k])
+        _count_body(view.T_camera_world @ T, rotations, own, samples, view, scale, counts[k])
     return counts
 
 
@@ -68,6 +70,7 @@ def _count_body(
     own: np.ndarray,
     samples: VisibleSamples,
     view: MeasuredView,
+    scale: float,
     counts: np.ndarray,
 ) -> None:
     """Add one body's pixels to (r, :data:`CASES`) ``counts``; (i,) ``own`` marks its instances."""
@@ -92,12 +95,12 @@ def _count_body(
             what, whose = NOT_MEASURED, 2
             if 0 <= u < width and 0 <= v < height:
                 behind = z - view.depth[v, u]
-                if abs(behind) <= _NEAR:
+                if abs(behind) <= scale * _NEAR:
                     normal = view.normals[v, u]
                     alike = normal[0] * nx + normal[1] * ny + normal[2] * nz > _ALIKE * NORMAL
                     what = FITTING if alike else FACING_ELSEWHERE
                 elif not np.isnan(behind):
-                    little = abs(behind) <= _FAR
+                    little = abs(behind) <= scale * _FAR
                     before, after = LITTLE_BEFORE if little else HIDDEN, LITTLE_BEHIND if little else LOOKED_THROUGH
                     what = before if behind > 0 else after
                 index = view.instance[v, u]

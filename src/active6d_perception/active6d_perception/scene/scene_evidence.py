@@ -119,7 +119,7 @@ class SceneEvidence:
         telling: (K, r, CASES) counts of the surface that tells rotations apart.
         container: (K, r, 5) of that surface, as in :class:`BodyEvidence`.
         neighbours: (K, r, 2) of that surface, likewise.
-        diameter: of the object, metres.
+        diameter: of the object, metres divided by :attr:`.Ambiguity.scale`, as all lengths here.
     """
 
     bodies: BodyEvidence

@@ -20,8 +20,9 @@ from active6d_perception.estimators.dense.measured_surface import MeasuredSurfac
 from active6d_perception.estimators.dense.orientation_search import OrientationSearch
 from active6d_perception.estimators.image_registration import register
 from active6d_perception.estimators.measured_image import MeasuredImage
-from active6d_perception.estimators.pose_selection import PoseSelection, length_scale
+from active6d_perception.estimators.pose_selection import PoseSelection
 from active6d_perception.model.ambiguity import ambiguity_of
+from active6d_perception.model.length_scale import length_scale
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.visible_samples import VisibleSamples, visible_samples
 

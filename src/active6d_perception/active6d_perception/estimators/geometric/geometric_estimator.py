@@ -25,9 +25,10 @@ from active6d_perception.estimators.pose_evidence import (
     comparable_share,
     weigh_poses,
 )
-from active6d_perception.estimators.pose_selection import judge_of, length_scale
+from active6d_perception.estimators.pose_selection import judge_of
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.estimators.score_model import ScoreModel
+from active6d_perception.model.length_scale import length_scale
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.model.visible_samples import visible_samples
