@@ -1,5 +1,7 @@
 """The registry, the budget's and the mask's arithmetic, and the baselines against their definitions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -106,14 +108,22 @@ def test_ninety_nine_moves_take_all_views(model, observe, name):
     assert sorted(run_episode(create_policy(name, model), observe, 42, 99)) == list(range(100))
 
 
-def test_a_position_next_to_a_view_counts_as_that_view(observe):
+@pytest.mark.parametrize("metres", [0.0, 0.005, 0.02])
+def test_a_position_next_to_a_view_counts_as_that_view(observe, metres):
+    """A robot's camera has arrived within two centimetres of its goal."""
     observation = observe([3])
-    beside = SPHERE.position(*(SPHERE.angles(SPHERE.positions[7]) + 0.005))
+    beside = SPHERE.position(*(SPHERE.angles(SPHERE.positions[7]) + [0.0, metres / SPHERE.radius]))
     moved = type(observation)(
         observation.objects, np.stack([SPHERE.positions[3], beside]), SPHERE, observation.allowed, 4
     )
     np.testing.assert_array_equal(np.flatnonzero(moved.visited()), [3, 7])
     assert moved.steps == 5
+
+
+def test_of_a_fine_grid_only_the_nearest_view_is_visited(observe):
+    fine, observation = ViewSphere(azimuths=720), observe([3])
+    moved = replace(observation, positions=fine.positions[[10, 1000]], sphere=fine, allowed=np.ones(len(fine), bool))
+    np.testing.assert_array_equal(np.flatnonzero(moved.visited()), [10, 1000])
 
 
 # The baselines

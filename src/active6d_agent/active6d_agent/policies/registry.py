@@ -20,8 +20,9 @@ from active6d_core.view_sphere import ViewSphere
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights"
 #: Learned policies look at this many objects at most.
 MAX_OBJECTS = 64
-#: A view of the grid counts as visited when the camera was this close to it, metres of arc.
-VISITED_WITHIN = 0.01
+#: A view of the grid counts as visited when the camera was this close to it, metres of arc, and to no other one closer.
+#: A robot's camera may stop some two centimetres from its goal.
+VISITED_WITHIN = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,10 @@ class Observation:
         """(M,) bool, views of the grid that the camera has taken."""
         grid, taken = self.sphere.positions / self.sphere.radius, self.positions
         taken = taken / np.linalg.norm(taken, axis=1, keepdims=True)
-        return (grid @ taken.T).max(axis=1) > np.cos(VISITED_WITHIN / self.sphere.radius)
+        cosine, visited = grid @ taken.T, np.zeros(len(grid), bool)
+        near = cosine.max(axis=0) > np.cos(VISITED_WITHIN / self.sphere.radius)
+        visited[cosine.argmax(axis=0)[near]] = True
+        return visited
 
     def candidates(self) -> np.ndarray:
         """(M,) bool, views that may be next: reachable, not visited, within the metres left."""
