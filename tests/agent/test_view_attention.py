@@ -687,6 +687,7 @@ def test_damaged_weights_are_refused_in_one_line(network, lookup, tmp_path, name
         ({"metres_weight": -1.0}, "metres_weight"),
         ({"lookahead": 2.0}, "lookahead"),
         ({"bin_width": 0.0}, "bin_width"),
+        ({"bin_depth": -1.0}, "bin_depth"),
         ({"wall_height": float("nan")}, "wall_height"),
     ],
 )

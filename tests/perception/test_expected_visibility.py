@@ -98,11 +98,11 @@ def test_only_those_that_hide_hide():
 
 def test_walls_hide_what_rays_through_boxes_miss():
     """Against ray casting of four thin walls, from all sides and levels."""
-    rng, tray = np.random.default_rng(2), Tray(0.3, 0.08)
-    points = rng.uniform([-0.15, -0.15, 0.0], [0.15, 0.15, 0.12], (30, 3))
+    rng, tray = np.random.default_rng(2), Tray(0.3, 0.2, 0.08)
+    points = rng.uniform([-0.15, -0.1, 0.0], [0.15, 0.1, 0.12], (30, 3))
     eyes = ViewSphere().positions
     scene = o3d.t.geometry.RaycastingScene()
-    for size, centre in [((0.3, 1e-4), (0.0, 0.15)), ((1e-4, 0.3), (0.15, 0.0))]:
+    for size, centre in [((0.3, 1e-4), (0.0, 0.1)), ((1e-4, 0.2), (0.15, 0.0))]:
         for sign in (-1, 1):
             box = o3d.t.geometry.TriangleMesh.create_box(*size, tray.wall_height)
             corner = [sign * centre[0] - size[0] / 2, sign * centre[1] - size[1] / 2, 0.0]

@@ -143,17 +143,17 @@ def test_what_is_solid_at_every_rotation_of_a_box_is_the_cylinder_in_it():
 
 
 def test_container_columns_of_a_stick():
-    """Eleven points along z from 0 to 10 cm, upright, 2 cm below the floor and 1 cm beyond the wall."""
+    """Eleven points along z from 0 to 10 cm, upright, 2 cm below the floor and 1 cm beyond a wall of each kind."""
     stick = np.column_stack([np.zeros(11), np.zeros(11), np.linspace(0, 0.1, 11)])
-    T = make_transform(np.eye(3), [[0.0, 0.0, -0.02], [0.11, 0.0, 0.0]])
-    found = against_container(T, IDENTITY, stick, Tray(0.2, 0.055), 1.0)[:, 0]
-    np.testing.assert_allclose(found[0], [2 / 11, -0.02, 0, -0.1, 0.03], atol=1e-9)
+    T = make_transform(np.eye(3), [[0.0, 0.0, -0.02], [0.11, 0.0, 0.0], [0.0, -0.09, 0.0]])
+    found = against_container(T, IDENTITY, stick, Tray(0.2, 0.16, 0.055), 1.0)[:, 0]
+    np.testing.assert_allclose(found[0], [2 / 11, -0.02, 0, -0.08, 0.03], atol=1e-9)
     # Six of the points are below the top of the wall.
-    np.testing.assert_allclose(found[1], [0, 0, 6 / 11, 0.01, 0.05], atol=1e-9)
+    np.testing.assert_allclose(found[1:], [[0, 0, 6 / 11, 0.01, 0.05]] * 2, atol=1e-9)
     open_table = against_container(T, IDENTITY, stick, OPEN_TABLE, 1.0)[:, 0]
-    np.testing.assert_allclose(open_table[:, 2:4], [[0, -1], [0, -1]])
+    np.testing.assert_allclose(open_table[:, 2:4], [[0, -1]] * 3)
     np.testing.assert_array_equal(
-        against_container(T, IDENTITY, np.zeros((0, 3)), OPEN_TABLE, 1.0), np.zeros((2, 1, 5))
+        against_container(T, IDENTITY, np.zeros((0, 3)), OPEN_TABLE, 1.0), np.zeros((3, 1, 5))
     )
 
 

@@ -273,7 +273,7 @@ def test_fusion_from_all_views_is_that_of_the_core(graph, seen, tmp_path, monkey
     monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path))
     weights = replace(BeliefWeights.indifferent(), probability=Scorer.of_weights(np.full(len(OBJECT_COLUMNS), 0.1)))
     weights.save(tmp_path / belief_file("mug"), "mug")
-    overrides = {"bin_width": 0.5, "wall_height": 0.0, "confirmed": 0.99}
+    overrides = {"bin_width": 0.5, "bin_depth": 0.4, "wall_height": 0.0, "confirmed": 0.99}
     graph.add(HypothesisFusionNode(context=graph.context, overrides=overrides))
     objects, markers = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(MarkerArray, "objects/markers", True)
     send(graph, fusion_messages(seen, SECOND), FUSION_INPUTS)
@@ -281,7 +281,7 @@ def test_fusion_from_all_views_is_that_of_the_core(graph, seen, tmp_path, monkey
     depth, hypotheses = seen
     model = load_object("mug")
     T_world_camera = SPHERE.pose(SPHERE.positions[3])
-    core = JointFusion(model, weights=weights, tray=Tray(0.5, 0.0))
+    core = JointFusion(model, weights=weights, tray=Tray(0.5, 0.4, 0.0))
     verification = Verifier(model).score(depth, CAMERA, hypotheses)
     core.add_view(SECOND, T_world_camera, hypotheses, verification, depth, CAMERA)
     expected = core.objects(SECOND, T_world_camera, CAMERA)

@@ -128,7 +128,8 @@ class HypothesisFusionNode(GraphNode):
         )
 
     def _declare_bin(self) -> None:
-        self.declare("bin_width", 0.0, "between the bin's inner walls, metres; 0: that of the usual bin", minimum=0.0)
+        self.declare("bin_width", 0.0, "bin between its walls, world x, metres; 0: that of the usual bin", minimum=0.0)
+        self.declare("bin_depth", 0.0, "bin between its walls, world y, metres; 0: as bin_width", minimum=0.0)
         self.declare(
             "wall_height",
             -1.0,
@@ -174,8 +175,9 @@ class HypothesisFusionNode(GraphNode):
     def _make_fusion(self, parameters: FusionParameters) -> SceneFusion | JointFusion:
         if self.value("method") == "best-view":
             return SceneFusion(self._model, parameters)
-        usual, width, height = Tray.for_model(self._model), self.value("bin_width"), self.value("wall_height")
-        tray = Tray(width or usual.width, usual.wall_height if height < 0 else height)
+        usual, height = Tray.for_model(self._model), self.value("wall_height")
+        width = self.value("bin_width") or usual.width
+        tray = Tray(width, self.value("bin_depth") or width, usual.wall_height if height < 0 else height)
         return JointFusion(self._model, parameters, tray=tray, align=self.value("align_views"))
 
     def _make_grid(self) -> SurfaceGrid:

@@ -36,21 +36,23 @@ def expected_visibility(model: ObjectModel) -> "ExpectedVisibility":
 
 
 class Tray(NamedTuple):
-    """The walls of a square bin around the world's origin."""
+    """The walls of a rectangular bin around the world's origin."""
 
     width: float
-    """between the inner walls, along world x and y, metres"""
+    """between the inner walls, along world x, metres"""
+    depth: float
+    """likewise along world y"""
     wall_height: float
     """above the floor at z = 0, metres"""
 
     @classmethod
     def for_model(cls, model: ObjectModel) -> "Tray":
         """The bin that the object's heaps usually lie in."""
-        return cls(model.bin_width, model.wall_height)
+        return cls(model.bin_width, model.bin_width, model.wall_height)
 
 
 #: A table without walls.
-OPEN_TABLE = Tray(0.0, -np.inf)
+OPEN_TABLE = Tray(0.0, 0.0, -np.inf)
 
 
 class _Stand(NamedTuple):
@@ -147,7 +149,8 @@ def walled(point: np.ndarray, eye: np.ndarray, tray: Tray) -> bool:
     leaves = np.float32(np.inf)
     for axis in range(2):
         ray = eye[axis] - point[axis]
-        to_wall = np.float32(0.5) * tray.width - np.copysign(np.float32(1.0), ray) * point[axis]
+        side = tray.width if axis == 0 else tray.depth
+        to_wall = np.float32(0.5) * side - np.copysign(np.float32(1.0), ray) * point[axis]
         leaves = min(leaves, to_wall / max(abs(ray), np.float32(1e-9)))
     return point[2] + leaves * (eye[2] - point[2]) < tray.wall_height
 

@@ -36,7 +36,7 @@ def against_container(
         3 mm of these; the farthest is negative inside. All are 0 without points.
     """
     result = np.zeros((len(T_world_object), len(rotations), 5))
-    half, count = 0.5 * tray.width, len(points)
+    half_x, half_y, count = 0.5 * tray.width, 0.5 * tray.depth, len(points)
     for k in range(len(T_world_object)):
         for r in range(len(rotations)):
             T, row = T_world_object[k] @ rotations[r], result[k, r]
@@ -46,7 +46,7 @@ def against_container(
                 x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
                 y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
                 z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-                beyond = max(abs(x), abs(y)) - half if z < tray.wall_height else -1.0
+                beyond = max(abs(x) - half_x, abs(y) - half_y) if z < tray.wall_height else -1.0
                 row[0] += z < -scale * _INTO_CONTAINER
                 row[1] = min(row[1], z / scale)
                 row[2] += beyond > scale * _INTO_CONTAINER

@@ -239,8 +239,9 @@ class ViewAttentionPolicy(DeterministicPolicy):
         error_weight: likewise.
         lookahead: likewise.
         stop_below: stop when this and all later moves are expected to gain less than this many objects; 0 never does.
-        bin_width: between the bin's inner walls, metres; by default that of the object's usual bin, as the next.
-        wall_height: of those walls above the floor, metres; 0 for an open table.
+        bin_width: between the bin's inner walls along world x, metres; by default that of the object's usual bin.
+        bin_depth: likewise along world y; by default as ``bin_width``.
+        wall_height: of those walls above the floor, metres; 0 for an open table, by default that of the usual bin.
 
     Raises:
         ValueError: there are no usable weights, or a number is out of range.
@@ -255,6 +256,7 @@ class ViewAttentionPolicy(DeterministicPolicy):
         lookahead: float | None = None,
         stop_below: float = 0.0,
         bin_width: float | None = None,
+        bin_depth: float | None = None,
         wall_height: float | None = None,
     ) -> None:
         path = Path(weights) if weights else weights_path("view-attention", model.name)
@@ -263,10 +265,17 @@ class ViewAttentionPolicy(DeterministicPolicy):
         given = {"metres_weight": metres_weight, "error_weight": error_weight, "lookahead": lookahead}
         self._model, self._stop_below = model, stop_below
         self._weighing = replace(weighing, **{name: value for name, value in given.items() if value is not None})
-        sizes = {"width": bin_width, "wall_height": wall_height}
-        self._tray = Tray.for_model(model)._replace(**{name: size for name, size in sizes.items() if size is not None})
-        if not (0 < self._tray.width < np.inf and 0 <= self._tray.wall_height < np.inf):
-            raise ValueError(f"bin_width must be positive and wall_height not negative, got {self._tray}")
+        usual = Tray.for_model(model)
+        width = usual.width if bin_width is None else bin_width
+        depth, height = (
+            width if bin_depth is None else bin_depth,
+            usual.wall_height if wall_height is None else wall_height,
+        )
+        if not (0 < width < np.inf and 0 < depth < np.inf and 0 <= height < np.inf):
+            raise ValueError(
+                f"bin_width and bin_depth must be positive and wall_height not negative, got {width}, {depth}, {height}"
+            )
+        self._tray = Tray(width, depth, height)
 
     def decide(self, observation: Observation) -> Decision:
         """The view of highest worth. The attention is each object's share of it."""
