@@ -7,6 +7,7 @@ import pytest
 from hand_made_scenes import store_mugs
 from typer.testing import CliRunner
 
+from active6d_core.camera import backproject
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.se3 import invert
 from active6d_perception.estimators.registry import register_estimator
@@ -26,9 +27,9 @@ class OneMoreEachView:
     def estimate(self, view):
         self._calls += 1
         T = invert(view.T_world_camera) @ TRUTH[0][: self._calls]
-        numbers = np.arange(1, len(T) + 1, dtype=np.uint16)
-        box = np.tile([0.4, 0.4, 0.6, 0.6], (len(T), 1))
-        return Hypotheses(T, np.full(len(T), 0.9), box, T[:, 2, 3], numbers, np.ones((480, 640), np.uint16))
+        apart = np.linalg.norm(backproject(view.depth, view.camera)[..., None, :] - T[:, :3, 3], axis=-1)
+        mask = np.where(apart.min(axis=-1) < 0.07, apart.argmin(axis=-1) + 1, 0).astype(np.uint16)
+        return Hypotheses.from_masks(T, np.full(len(T), 0.9), np.arange(1, len(T) + 1), mask, view.depth)
 
 
 def test_seconds_refusals_and_what_is_found_are_counted(tmp_path, monkeypatch):

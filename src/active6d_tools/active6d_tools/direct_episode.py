@@ -14,6 +14,7 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.registry import AUTOMATIC
 from active6d_perception.estimators.registry import create_estimator
 from active6d_perception.scene.fusion import SceneFusion
+from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.observed_surface import ObservedSurface
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.simulator import GoalError
@@ -94,10 +95,12 @@ class DirectRunner:
     Args:
         model: of the object.
         limits: of every episode.
+        fusion: of all views in the object's usual bin, as the graph's, when None.
     """
 
-    def __init__(self, model: ObjectModel, limits: Limits) -> None:
-        self.limits, self._fusion, self._surface = limits, SceneFusion(model), ObservedSurface(model)
+    def __init__(self, model: ObjectModel, limits: Limits, fusion: JointFusion | SceneFusion | None = None) -> None:
+        self.limits, self._surface = limits, ObservedSurface(model)
+        self._fusion = JointFusion(model) if fusion is None else fusion
 
     def run(self, policy: Policy, camera: DirectCamera, rng: np.random.Generator) -> DirectEpisode:
         """Run one episode to its end; ``rng`` is the policy's."""
@@ -109,7 +112,11 @@ class DirectRunner:
         state = EpisodeState(seen.view.stamp, self.limits)
         while True:
             view = seen.view
-            fusion.add_view(view.stamp, view.T_world_camera, seen.hypotheses, seen.verification)
+            known = view.stamp, view.T_world_camera, seen.hypotheses, seen.verification
+            if isinstance(fusion, JointFusion):
+                fusion.add_view(*known, view.depth, view.camera)
+            else:
+                fusion.add_view(*known)
             surface.add_view(view.stamp, view.depth, view.camera, view.T_world_camera)
             shown = view.T_world_camera if seen.T_world_shown is None else seen.T_world_shown
             objects = fusion.objects(view.stamp, shown, view.camera)

@@ -18,6 +18,7 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.registry import AUTOMATIC
 from active6d_core.se3 import invert
 from active6d_perception.active6d import check_span
+from active6d_perception.scene.fusion import SceneFusion
 from active6d_sim.datasets.bop import CAMERA_FILE, TRUTH_FILE, BopScene
 from active6d_sim.datasets.bop_models import differs_from_data_set
 from active6d_tools.bop_results import BopEstimates
@@ -121,7 +122,9 @@ class RecordedEvaluation:
             own = {"entropy": self._entropy(scene)} if name == "entropy" else {}
             policy = create_policy(name, self._model, **{**own, **parameters})
             camera = RecordedCamera(scene, start)
-            runner = DirectRunner(self._model, Limits(scene.sphere, scene.allowed, self._steps))
+            limits = Limits(scene.sphere, scene.allowed, self._steps)
+            # Fusion of all views needs to know the floor and the walls, which recordings do not tell.
+            runner = DirectRunner(self._model, limits, SceneFusion(self._model))
             episode = runner.run(policy, camera, np.random.default_rng([self._seed, number, start]))
             rows.append(self._score(number, episode, camera))
             estimates.append(_estimates(scene, episode, camera))
