@@ -191,6 +191,14 @@ def test_shards_come_back(tmp_path, mug_view):
         read_shard(tmp_path / "b.npz")
 
 
+def test_depth_beyond_what_a_shard_holds_is_missing(tmp_path, mug_view):
+    sample, far = mug_view[0], mug_view[0].view.depth.copy()
+    far[:10] = 12.0
+    write_shard(tmp_path / "a.npz", [replace(sample, view=replace(sample.view, depth=far))])
+    (back,) = read_shard(tmp_path / "a.npz")
+    assert np.isnan(back.view.depth[:10]).all()
+
+
 def test_truth_of_another_size_is_refused(mug_view):
     sample, view = mug_view
     with pytest.raises(ValueError, match="truth of a training view must be"):

@@ -79,8 +79,9 @@ def read_shard(path: Path) -> list[TrainingView]:
 
 
 def _pack_depth(depth: np.ndarray) -> np.ndarray:
-    """float metres to uint16 tenths of millimetres, 0 where invalid."""
-    return np.clip(np.rint(np.nan_to_num(depth) / _DEPTH_UNIT), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    """float metres to uint16 tenths of millimetres, 0 where invalid or farther than these reach."""
+    steps = np.rint(np.nan_to_num(depth) / _DEPTH_UNIT)
+    return np.where(steps <= np.iinfo(np.uint16).max, np.maximum(steps, 0), 0).astype(np.uint16)
 
 
 def _unpack_depth(packed: np.ndarray) -> np.ndarray:
