@@ -330,7 +330,8 @@ def test_the_papers_policy_is_trained_in_full_and_begun_trainings_go_on(banks, t
 
     asked = []
 
-    def train(train, val, folder, parameters, reward, *, resume):
+    def train(train, val, folder, parameters, reward, *, resume, again):
+        assert not again
         asked.append((folder.name, parameters, resume))
         yield from ()
 
