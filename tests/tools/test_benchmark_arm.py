@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.se3 import invert
 from active6d_perception.estimators.registry import register_estimator
-from active6d_tools.benchmark.arm_episodes import TIMES
+from active6d_tools.benchmark.arm_episodes import TIMES, _summarise
 from active6d_tools.cli import app
 
 TRUTH = []
@@ -29,6 +29,24 @@ class OneMoreEachView:
         numbers = np.arange(1, len(T) + 1, dtype=np.uint16)
         box = np.tile([0.4, 0.4, 0.6, 0.6], (len(T), 1))
         return Hypotheses(T, np.full(len(T), 0.9), box, T[:, 2, 3], numbers, np.ones((480, 640), np.uint16))
+
+
+def test_a_policy_that_makes_no_move_has_no_numbers_of_moves(tmp_path, monkeypatch):
+    """All episodes without a move, and one of two."""
+    scene = store_mugs(tmp_path, monkeypatch)
+    TRUTH[:] = [scene.T_world_object]
+    told = tmp_path / "arm.json"
+    options = "--policies", "single-view", "--episodes", 1, "--steps", 1, "--estimator", "one-more-each-view"
+    run = CliRunner().invoke(app, [str(each) for each in ("benchmark", "arm", *options, "--json", told)])
+    assert run.exit_code == 0, run.output
+    row = json.loads(told.read_text())["policies"]["single-view"]
+    assert (row["moves"], row["seconds_per_move"], row["least_clearance_mm"]) == (0, None, None)
+    assert (row["seconds_per_episode"], row["metres"], len(row["found"])) == (0.0, 0.0, 1)
+    assert run.stdout.splitlines()[-1].split().count("-") == 3
+    stayed = {"found": [0.5], "found_at": [0.5], "seconds": [], "clearances": [], "refused": [], "metres": 0.0}
+    moved = {**stayed, "found": [0.5, 1.0], "seconds": [2.0], "clearances": [0.02]}
+    both = _summarise([stayed, moved])
+    assert (both["moves"], both["seconds_per_move"], both["least_clearance_mm"]) == (1, 2.0, pytest.approx(20.0))
 
 
 def test_seconds_refusals_and_what_is_found_are_counted(tmp_path, monkeypatch):
