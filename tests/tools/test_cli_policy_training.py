@@ -89,9 +89,14 @@ def test_a_training_that_is_there_goes_on_or_is_replaced_only_when_asked(banks, 
         (["--policy", "attention", "--set", "reward.alpha=3"], "alpha and beta must be in [0, 1]"),
         (["--set", "weighing.lookahead=2"], "lookahead is 2"),
         (["--resume", "--again"], "--resume continues the training that is there and --again replaces it"),
-        (["--set", "training.learning_rate=fast"], "--set training.learning_rate: 'fast' is no float"),
-        (["--set", "training.rounds=1.5"], "--set training.rounds: 1.5 is no int"),
-        (["--set", "training.rounds=true"], "--set training.rounds: True is no int"),
+        (["--set", "training.learning_rate=fast"], "--set training.learning_rate must be a number, got 'fast'"),
+        (["--set", "training.rounds=1.5"], "--set training.rounds must be a whole number, got 1.5"),
+        (["--set", "training.rounds=true"], "--set training.rounds must be a whole number, got True"),
+        (["--set", "training.inputs=3"], "--set training.inputs must be a text, got 3"),
+        (
+            ["--policy", "attention", "--set", "training.credit=1"],
+            "--set training.credit must be true or false, got 1",
+        ),
     ],
 )
 def test_bad_input_is_one_clear_line(banks, arguments, words):

@@ -10,6 +10,8 @@ from active6d_agent.bank.scene_lookup import SceneLookup
 
 #: Weights of the checkpoint with the best validation result, in the folder of a training.
 BEST = "best.safetensors"
+#: What a user calls the types of parameters.
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ def _make(kind: type, group: str, own: dict[str, Any], groups: dict[str, dict[st
         if not isinstance(value, (int, float) if wanted is float else wanted) or isinstance(value, bool) > (
             wanted is bool
         ):
-            raise ValueError(f"--set {group}.{item.name}: {value!r} is no {wanted.__name__}")
+            raise ValueError(f"--set {group}.{item.name} must be {_KINDS[wanted]}, got {value!r}")
     try:
         return kind(**{**own, **given})
     except TypeError as error:
