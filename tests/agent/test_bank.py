@@ -70,6 +70,39 @@ def test_scenes_made_otherwise_are_made_again(tmp_path):
     assert load_bank(path).provenance == {"noise": 2}
 
 
+@pytest.fixture
+def stored(tmp_path):
+    """A bank of three scenes in a file, to be extended."""
+    bank = synthetic_bank("mug", scenes=3, objects=3)
+    bank.save(tmp_path / "bank.npz")
+    return bank
+
+
+def test_a_bank_keeps_the_scenes_that_are_not_asked_for_again(stored, tmp_path):
+    path, log, dropped = tmp_path / "bank.npz", tmp_path / "log", []
+    observe = functools.partial(observe_synthetic, log=str(log))
+    names = ["mug/synthetic/4", "mug/synthetic/1"]
+    list(build_bank(path, "mug", names, observe, provenance=stored.provenance, on_drop=dropped.extend))
+    scenes = load_bank(path).scenes
+    assert [scene.name for scene in scenes] == [*names, "mug/synthetic/0", "mug/synthetic/2"]
+    assert_equal(scenes[3], stored.scenes[2])
+    assert log.read_text().split() == names[:1]
+    assert dropped == []
+
+
+def test_scenes_that_cannot_stay_are_named_before_the_work(stored, tmp_path):
+    path, log, dropped = tmp_path / "bank.npz", tmp_path / "log", []
+
+    def on_drop(names):
+        assert not log.exists()
+        dropped.append(names)
+
+    observe = functools.partial(observe_synthetic, log=str(log))
+    list(build_bank(path, "mug", ["mug/synthetic/1"], observe, provenance={"noise": 2}, on_drop=on_drop))
+    assert dropped == [["mug/synthetic/0", "mug/synthetic/2"]]
+    assert [scene.name for scene in load_bank(path).scenes] == ["mug/synthetic/1"]
+
+
 def test_an_interrupted_scene_goes_on_with_its_next_view(tmp_path):
     """The camera fails at the fourth view. A view whose file is damaged is observed again."""
     log = tmp_path / "log"

@@ -47,6 +47,14 @@ def test_refused_views_are_not_chosen_again(policy):
     assert (np.diff(arcs) <= 1e-9).all()
 
 
+def test_a_policy_that_stops_is_named_as_the_reason():
+    policy = create_policy("single-view", load_object("mug"))
+    policy.reset(np.random.default_rng(0))
+    decision, reason = decide(make_state(), policy)
+    assert decision.stop
+    assert reason == "the policy stopped: no view is worth the move"
+
+
 def test_struck_views_stay_struck_after_the_next_view(policy):
     state = make_state(views=[5, 9])
     first = decide(state, policy)[0].view

@@ -2,8 +2,10 @@
 
 import os
 import re
+import socket
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -66,6 +68,27 @@ def test_what_receives_is_bound_to_the_loopback_interface_only():
     environment = {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
     keep_on_this_machine(environment)
     assert environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"  # other middleware does not read the profile
+
+
+def test_programs_after_many_others_see_each_other():
+    """The ports of forty participants are taken, as by eight episodes with a process for each node."""
+    domain, taken = fresh_domain(), []
+    for number in range(40):
+        taken.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        taken[-1].bind(("127.0.0.1", 7410 + 250 * domain + 2 * number))
+    contexts = [Context() for _ in range(2)]
+    for context in contexts:
+        context.init(args=[], domain_id=domain)
+    nodes = [Node(name, context=context) for name, context in zip(("first", "second"), contexts, strict=True)]
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline and not all(len(node.get_node_names()) == 2 for node in nodes):
+        time.sleep(0.05)
+    assert all(sorted(node.get_node_names()) == ["first", "second"] for node in nodes)
+    for node, context in zip(nodes, contexts, strict=True):
+        node.destroy_node()
+        context.try_shutdown()
+    for each in taken:
+        each.close()
 
 
 def test_a_graph_on_the_network_has_sockets_only():

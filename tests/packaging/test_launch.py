@@ -146,6 +146,7 @@ def test_a_cell_is_the_graph_with_the_adapter_and_a_recorder(monkeypatch):
     assert (given["camera"], given["record"]) == ("adapter", "true")
     assert given.keys() == cell["ARGUMENTS"].keys() | {"camera", "record"}
     assert given.keys() <= graph
+    assert cell["ARGUMENTS"]["network"][0] == "false"
     needed = {name for name, (default, _) in cell["ARGUMENTS"].items() if default is None}
     assert needed == {"object", "params_file", "bag"}
     assert all(len(description) > 10 for _, description in cell["ARGUMENTS"].values())

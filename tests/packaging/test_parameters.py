@@ -5,7 +5,9 @@ from pathlib import Path
 
 import yaml
 
+from active6d_core.ros.graph_nodes import NODES
 from active6d_core.ros.node import GraphNode
+from active6d_tools import describe_nodes
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "src/active6d_bringup/config/active6d.yaml"
@@ -25,6 +27,19 @@ def test_names_and_defaults_agree(node):
     defaults = declared(node)
     assert written == defaults, UPDATE
     assert [type(written[name]) for name in defaults] == [type(value) for value in defaults.values()]
+
+
+def test_the_generated_sections_are_what_would_be_written_now(node):
+    """Descriptions, limits and choices too, which the other tests do not look at."""
+    name, file, page = node.get_name(), FILE.read_text(), (ROOT / "docs/graph.md").read_text()
+    section = re.search(rf"^/\*\*/{name}:\n.*?(?=\n/\*\*/|\Z)", file, re.DOTALL | re.MULTILINE)[0]
+    assert section == describe_nodes.parameter_section(name, node), UPDATE
+    tables = re.search(rf"<!-- tables of {name} -->\n(.*?)\n<!-- end -->", page, re.DOTALL)[1]
+    assert tables == describe_nodes.page_section(node), UPDATE
+
+
+def test_the_file_has_a_section_for_every_node():
+    assert re.findall(r"^/\*\*/(\w+):", FILE.read_text(), re.MULTILINE) == list(reversed(NODES)), UPDATE
 
 
 def test_parameters_are_described(node):

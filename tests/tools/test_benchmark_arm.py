@@ -11,7 +11,7 @@ from active6d_core.camera import backproject
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.se3 import invert
 from active6d_perception.estimators.registry import register_estimator
-from active6d_tools.benchmark.arm_episodes import TIMES
+from active6d_tools.benchmark.arm_episodes import TIMES, _summarise
 from active6d_tools.cli import app
 
 TRUTH = []
@@ -30,6 +30,24 @@ class OneMoreEachView:
         apart = np.linalg.norm(backproject(view.depth, view.camera)[..., None, :] - T[:, :3, 3], axis=-1)
         mask = np.where(apart.min(axis=-1) < 0.07, apart.argmin(axis=-1) + 1, 0).astype(np.uint16)
         return Hypotheses.from_masks(T, np.full(len(T), 0.9), np.arange(1, len(T) + 1), mask, view.depth)
+
+
+def test_a_policy_that_makes_no_move_has_no_numbers_of_moves(tmp_path, monkeypatch):
+    """All episodes without a move, and one of two."""
+    scene = store_mugs(tmp_path, monkeypatch)
+    TRUTH[:] = [scene.T_world_object]
+    told = tmp_path / "arm.json"
+    options = "--policies", "single-view", "--episodes", 1, "--steps", 1, "--estimator", "one-more-each-view"
+    run = CliRunner().invoke(app, [str(each) for each in ("benchmark", "arm", *options, "--json", told)])
+    assert run.exit_code == 0, run.output
+    row = json.loads(told.read_text())["policies"]["single-view"]
+    assert (row["moves"], row["seconds_per_move"], row["least_clearance_mm"]) == (0, None, None)
+    assert (row["seconds_per_episode"], row["metres"], len(row["found"])) == (0.0, 0.0, 1)
+    assert run.stdout.splitlines()[-1].split().count("-") == 3
+    stayed = {"found": [0.5], "found_at": [0.5], "seconds": [], "clearances": [], "refused": [], "metres": 0.0}
+    moved = {**stayed, "found": [0.5, 1.0], "seconds": [2.0], "clearances": [0.02]}
+    both = _summarise([stayed, moved])
+    assert (both["moves"], both["seconds_per_move"], both["least_clearance_mm"]) == (1, 2.0, pytest.approx(20.0))
 
 
 def test_seconds_refusals_and_what_is_found_are_counted(tmp_path, monkeypatch):

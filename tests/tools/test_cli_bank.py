@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from synthetic_bank import synthetic_bank
 from typer.testing import CliRunner
 
 from active6d_agent.bank.batched_fusion import BatchedFusion
@@ -55,7 +56,7 @@ def test_a_policys_parameter_can_be_set(banks, tmp_path):
 
 
 def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp_path):
-    """Two scenes from synthetic eyes; the second run makes only the third scene."""
+    """Two scenes from synthetic eyes; the second run makes only the third scene, and the next ones remove none."""
     from functools import partial
 
     from synthetic_bank import observe_synthetic
@@ -77,6 +78,9 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
     assert sorted(log.read_text().split()) == ["mug/val/0", "mug/val/1"]
     assert run(*arguments, "--scenes", "3").exit_code == 0
     assert log.read_text().split()[2:] == ["mug/val/2"]
+    fewer = run(*arguments, "--scenes", "1", "--json", str(tmp_path / "fewer.json"))
+    assert "also keeps 2 scenes from before" in fewer.stderr
+    assert json.loads((tmp_path / "fewer.json").read_text())["scenes"] == 1, "the summary is of what was asked for"
     made = load_bank(find_bank("mug", "val", tmp_path))
     assert len(made.scenes) == 3
     measured = json.loads((tmp_path / "bank.json").read_text())
@@ -86,6 +90,23 @@ def test_a_bank_is_what_the_estimator_says_and_is_only_extended(monkeypatch, tmp
         right = scene.errors < 0.1 * made.model.diameter
         found += [right[scene.view == view].any(axis=0).mean() for view in range(100)]
     assert measured["found_in_one_view"] == pytest.approx(np.mean(found))
+
+
+def test_scenes_that_a_bank_loses_are_named(monkeypatch, tmp_path):
+    from active6d_agent.bank import scene_bank as bank_module
+
+    def build(path, object_name, names, observe, *, on_drop, **keywords):
+        on_drop(["mug/val/1", "mug/val/2"])
+        synthetic_bank("mug", scenes=1, objects=2).save(path)
+        yield from names
+
+    monkeypatch.setattr(bank_module, "build_bank", build)
+    result = run("bank", "--object", "mug", "--split", "val", "--scenes", "1", "--banks", str(tmp_path))
+    assert result.exit_code == 0, result.stderr
+    told = " ".join(result.stderr.split())
+    assert f"{bank_path(tmp_path, 'mug', 'val')} was made with another estimator" in told
+    assert "dropped: mug/val/1, mug/val/2. " in told
+    assert "also keeps" not in told
 
 
 def test_no_heap_is_in_two_splits():
@@ -309,7 +330,8 @@ def test_the_papers_policy_is_trained_in_full_and_begun_trainings_go_on(banks, t
 
     asked = []
 
-    def train(train, val, folder, parameters, reward, *, resume):
+    def train(train, val, folder, parameters, reward, *, resume, again):
+        assert not again
         asked.append((folder.name, parameters, resume))
         yield from ()
 

@@ -55,6 +55,29 @@ def test_what_is_trained_is_exported_and_evaluated(banks, tmp_path, name, length
         assert measured["detection_rate"] == pytest.approx(max(row["detection_rate"] for row in curve))
 
 
+@pytest.mark.parametrize("flag", [None, "--resume", "--again"])
+def test_a_training_that_is_there_goes_on_or_is_replaced_only_when_asked(banks, tmp_path, monkeypatch, flag):
+    from active6d_agent.policies.view_attention import dagger
+
+    asked = []
+
+    def train(train, val, folder, parameters, weighing, *, resume, again):
+        asked.append({"--resume": resume, "--again": again})
+        yield from ()
+
+    monkeypatch.setattr(dagger, "train_dagger", train)
+    for name in ("latest.json", "curve.jsonl"):
+        (tmp_path / name).write_text("{}\n")
+    result = run("train", "policy", "--banks", str(banks), "--out", str(tmp_path), *([flag] if flag else []))
+    if flag:
+        assert result.exit_code == 0, result.stderr
+        assert asked == [{"--resume": flag == "--resume", "--again": flag == "--again"}]
+    else:
+        assert (result.exit_code, asked) == (2, [])
+        told = " ".join(result.stderr.split())
+        assert all(word in told for word in ("already holds a training", tmp_path.name, "--resume", "--again"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -65,9 +88,15 @@ def test_what_is_trained_is_exported_and_evaluated(banks, tmp_path, name, length
         (["--set", "reward.alpha=1"], "--set reward: known are training, weighing"),
         (["--policy", "attention", "--set", "reward.alpha=3"], "alpha and beta must be in [0, 1]"),
         (["--set", "weighing.lookahead=2"], "lookahead is 2"),
-        (["--set", "training.learning_rate=fast"], "--set training.learning_rate: 'fast' is no float"),
-        (["--set", "training.rounds=1.5"], "--set training.rounds: 1.5 is no int"),
-        (["--set", "training.rounds=true"], "--set training.rounds: True is no int"),
+        (["--resume", "--again"], "--resume continues the training that is there and --again replaces it"),
+        (["--set", "training.learning_rate=fast"], "--set training.learning_rate must be a number, got 'fast'"),
+        (["--set", "training.rounds=1.5"], "--set training.rounds must be a whole number, got 1.5"),
+        (["--set", "training.rounds=true"], "--set training.rounds must be a whole number, got True"),
+        (["--set", "training.inputs=3"], "--set training.inputs must be a text, got 3"),
+        (
+            ["--policy", "attention", "--set", "training.credit=1"],
+            "--set training.credit must be true or false, got 1",
+        ),
     ],
 )
 def test_bad_input_is_one_clear_line(banks, arguments, words):

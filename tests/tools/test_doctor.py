@@ -1,6 +1,7 @@
 """The doctor finds what is missing, and says so in a form that scripts can read."""
 
 import json
+import sys
 
 import pytest
 from typer.testing import CliRunner
@@ -19,7 +20,8 @@ def test_this_machine_is_well(tmp_path):
     checks = {check["name"]: check for check in document["checks"]}
     for name in ("Python", "rclpy", "middleware", "pybullet", "open3d", "rosbags", "object models"):
         assert checks[name]["ok"], checks[name]
-    for name in ("two nodes exchange a message", "ray casting a view", "writing and reading a bag"):
+    self_tests = ("two nodes exchange a message", "ray casting a view", "loading the graph of an episode")
+    for name in (*self_tests, "writing and reading a bag", "mcap", "zstandard", "opencv-contrib-python-headless"):
         assert checks[name]["ok"], checks[name]
         assert checks[name]["needed"]
     assert all(check["fix"] for check in checks.values() if not check["ok"])
@@ -46,6 +48,14 @@ def test_a_library_that_breaks_while_loading_is_a_finding(tmp_path, monkeypatch)
     monkeypatch.syspath_prepend(tmp_path)
     check = machine_doctor._import_check("A", "brittle_library", "brittle", needed=True, fix="fix it")
     assert (check.ok, check.detail, check.fix) == (False, "libusb-1.0.so.0: cannot open", "fix it")
+
+
+@pytest.mark.parametrize("module", ["active6d_bringup.graph.episode", "active6d_bringup.bags.writer"])
+def test_what_the_recorder_cannot_load_fails_a_self_test(monkeypatch, module):
+    """Whatever library it is: None in ``sys.modules`` makes an import fail."""
+    monkeypatch.setitem(sys.modules, module, None)
+    failed = {check.name for check in machine_doctor._self_tests() if not check.ok and check.needed}
+    assert failed == {"loading the graph of an episode" if "graph" in module else "writing and reading a bag"}
 
 
 def test_folders_and_a_domain_that_cannot_be_used_are_findings(tmp_path, monkeypatch):

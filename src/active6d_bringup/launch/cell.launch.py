@@ -27,6 +27,10 @@ ARGUMENTS = {
     "steps": ("5", "moves in an episode: the arm stands at one view more"),
     "metres": ("", "travel budget of an episode in metres; empty: as in params_file"),
     "namespace": ("", "prefix of every node and topic, for several cells on one network"),
+    "network": (
+        "false",
+        "true: other machines, such as a driver's, reach the nodes; false: 127.0.0.1 only",
+    ),
     "rviz": ("false", "show camera, objects and goals in RViz"),
 }
 

@@ -19,6 +19,8 @@ from active6d_core.files import cache_folder
 from active6d_core.ros.network import domain_of
 
 PIP = "pip install -r requirements.txt"
+# Modules whose distribution has another name.
+_DISTRIBUTIONS = {"PIL": "pillow", "cv2": "opencv-contrib-python-headless"}
 APT_ROS = "only with an apt installation of ROS 2 Jazzy: apt install ros-jazzy-"
 
 
@@ -71,8 +73,8 @@ def _libraries() -> Iterator[Check]:
         found = ctypes.util.find_library(file)
         fix = "" if found else f"apt install {package} (as root); Open3D loads it"
         yield Check("System libraries", f"lib{file}", bool(found), False, found or "not found", fix)
-    for module in "numba numpy scipy trimesh open3d rosbags jinja2 matplotlib PIL".split():
-        distribution = "pillow" if module == "PIL" else module
+    for module in "numba numpy scipy trimesh open3d cv2 rosbags mcap zstandard jinja2 matplotlib PIL".split():
+        distribution = _DISTRIBUTIONS.get(module, module)
         yield _import_check("Python libraries", module, distribution, needed=True, fix=PIP)
     optional = {
         # The wrapper, since pybullet itself prints a banner.
@@ -81,7 +83,6 @@ def _libraries() -> Iterator[Check]:
         "safetensors": ("safetensors", "weights"),
         "gymnasium": ("gymnasium", "training policies"),
         "stable_baselines3": ("stable-baselines3", "training policies"),
-        "mcap": ("mcap", "a second reader of bags, for the tests; in requirements-dev.txt"),
     }
     for module, (distribution, purpose) in optional.items():
         yield _import_check("Python libraries", module, distribution, needed=False, fix=f"{PIP} ({purpose})")
@@ -178,6 +179,7 @@ def _self_tests() -> Iterator[Check]:
     )
     yield _attempt("Self test", "two nodes exchange a message", _exchange_message, network)
     yield _attempt("Self test", "ray casting a view", _cast_rays, "reinstall open3d, check libusb-1.0-0 and libgl1")
+    yield _attempt("Self test", "loading the graph of an episode", _load_episode, PIP)
     yield _attempt("Self test", "writing and reading a bag", _write_bag, PIP)
 
 
@@ -246,22 +248,29 @@ def _cast_rays() -> str:
     return f"{hits} rays hit {model.name}"
 
 
-def _write_bag() -> str:
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
+def _load_episode() -> str:
+    """Import what ``active6d episode`` imports, whatever libraries that needs."""
+    return importlib.import_module("active6d_bringup.graph.episode").__name__
 
-    store = get_typestore(Stores.ROS2_JAZZY)
-    message_type = store.types["std_msgs/msg/String"]
+
+def _write_bag() -> str:
+    """A bag of one message by the recorder's writer, read by another library."""
+    from rclpy.serialization import serialize_message
+    from rosbags.rosbag2 import Reader
+
+    from active6d_bringup.bags.writer import TYPESTORE, EpisodeWriter
+    from active6d_core.ros.topics import CONTRACT, EPISODE_START
+
+    sent = EPISODE_START.message_type()
+    sent.header.frame_id = "hello"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bag"
-        writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        with writer:
-            connection = writer.add_connection("/echo", message_type.__msgtype__, typestore=store)
-            writer.write(connection, 1, store.serialize_cdr(message_type(data="hello"), message_type.__msgtype__))
+        writer = EpisodeWriter(path, {topic.name: f"/{topic.name.lstrip('/')}" for topic in CONTRACT})
+        writer.write(EPISODE_START.name, serialize_message(sent), 1)
+        writer.close()
         with Reader(path) as reader:
             [(_, _, raw)] = reader.messages()
-            message: Any = store.deserialize_cdr(raw, message_type.__msgtype__)
-    if message.data != "hello":
+            message: Any = TYPESTORE.deserialize_cdr(raw, EPISODE_START.type)
+    if message.header.frame_id != sent.header.frame_id:
         raise ValueError("the bag gave back another message")
     return "MCAP with zstd chunks"

@@ -10,6 +10,8 @@ from active6d_agent.bank.scene_lookup import SceneLookup
 
 #: Weights of the checkpoint with the best validation result, in the folder of a training.
 BEST = "best.safetensors"
+#: What a user calls the types of parameters.
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ def plan_training(
     length: int | None = None,
     groups: dict[str, dict[str, Any]] | None = None,
     resume: bool = False,
+    again: bool = False,
 ) -> PolicyTraining:
     """A training of "view-attention" (DAgger), or of "attention" or "attention-paper" (PPO); nothing starts yet.
 
@@ -63,22 +66,28 @@ def plan_training(
         length: number of rounds of DAgger or of environment steps of PPO; None for the default.
         groups: parameters by group: training, weighing (view-attention) and reward (attention).
         resume: continue the training in that folder.
+        again: replace the training in that folder.
 
     Raises:
-        ValueError: an unknown group or parameter, or a value out of range.
+        ValueError: an unknown group or parameter, a value out of range, or a folder with a training that is neither to
+            go on nor to be replaced.
     """
+    from active6d_agent.policies.training_folder import refuse_begun
+
+    refuse_begun(folder, resume=resume, again=again)  # before the banks are read
+    how = {"resume": resume, "again": again}
     common: dict[str, Any] = {"steps": steps, "seed": seed}
     if policy == "view-attention":
-        return _plan_dagger(folder, common, length, groups or {}, resume)
+        return _plan_dagger(folder, common, length, groups or {}, how)
     if policy == "attention-paper":
         from active6d_agent.policies.attention.ppo import AS_IN_THE_PAPER
 
         common |= AS_IN_THE_PAPER
-    return _plan_ppo(folder, common, length, groups or {}, resume)
+    return _plan_ppo(folder, common, length, groups or {}, how)
 
 
 def _plan_dagger(
-    folder: Path, common: dict[str, Any], length: int | None, groups: dict[str, Any], resume: bool
+    folder: Path, common: dict[str, Any], length: int | None, groups: dict[str, Any], how: dict[str, bool]
 ) -> PolicyTraining:
     from active6d_agent.policies.view_attention.dagger import DaggerParameters, train_dagger
     from active6d_agent.policies.view_attention.network import Weighing
@@ -90,12 +99,12 @@ def _plan_dagger(
     return PolicyTraining(
         folder,
         parameters.rounds,
-        lambda train, val: train_dagger(train, val, folder, parameters, weighing, resume=resume),
+        lambda train, val: train_dagger(train, val, folder, parameters, weighing, **how),
     )
 
 
 def _plan_ppo(
-    folder: Path, common: dict[str, Any], length: int | None, groups: dict[str, Any], resume: bool
+    folder: Path, common: dict[str, Any], length: int | None, groups: dict[str, Any], how: dict[str, bool]
 ) -> PolicyTraining:
     from active6d_agent.environment.episodes import RewardParameters
     from active6d_agent.policies.attention.ppo import PpoParameters, train_ppo
@@ -111,7 +120,7 @@ def _plan_ppo(
     return PolicyTraining(
         folder,
         parameters.total,
-        lambda train, val: train_ppo(train, val, folder, parameters, reward, resume=resume),
+        lambda train, val: train_ppo(train, val, folder, parameters, reward, **how),
     )
 
 
@@ -131,7 +140,7 @@ def _make(kind: type, group: str, own: dict[str, Any], groups: dict[str, dict[st
         if not isinstance(value, (int, float) if wanted is float else wanted) or isinstance(value, bool) > (
             wanted is bool
         ):
-            raise ValueError(f"--set {group}.{item.name}: {value!r} is no {wanted.__name__}")
+            raise ValueError(f"--set {group}.{item.name} must be {_KINDS[wanted]}, got {value!r}")
     try:
         return kind(**{**own, **given})
     except TypeError as error:

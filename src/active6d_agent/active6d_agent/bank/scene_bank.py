@@ -95,12 +95,13 @@ def build_bank(
     provenance: dict[str, Any] | None = None,
     sphere: ViewSphere | None = None,
     grid: SurfaceGrid | None = None,
+    on_drop: Callable[[list[str]], None] = lambda names: None,
 ) -> Iterator[str]:
     """Observe all scenes and write the bank; yields each scene's name as it is done.
 
     Finished scenes, and the views of unfinished ones, are kept beside ``path`` until the bank is complete, so an
-    interrupted run continues where it stopped. An existing bank is extended. Scenes of another ``provenance`` are made
-    again.
+    interrupted run continues where it stopped. An existing bank is extended: its other scenes stay, after the given
+    ones. Scenes of another ``provenance`` cannot stay; the given ones are made again, the others dropped.
 
     Args:
         path: of the ``.npz`` to write.
@@ -112,14 +113,19 @@ def build_bank(
         provenance: what the bank depends on and remembers: estimator, its parameters, noise, versions; JSON values.
         sphere: grid of the views, the default one when None.
         grid: of the surface, the object's usual one when None.
+        on_drop: called before the work with the names of scenes that the existing bank has and the new one will not.
     """
     grid = grid or SurfaceGrid.for_model(load_object(object_name))
     empty = SceneBank(object_name, sphere or ViewSphere(), grid, [], provenance or {})
-    known = _scenes_of(path, empty)
+    stored = _stored_bank(path)
+    known = _scenes_made_as(stored, empty)
+    dropped = [scene.name for scene in stored.scenes if scene.name not in {*known, *scenes}] if stored else []
+    if dropped:
+        on_drop(dropped)
     parts = path.with_suffix(".parts")
     make_folder(parts)
     files = {name: parts / (name.replace("/", "-") + ".npz") for name in scenes if name not in known}
-    missing = [name for name, file in files.items() if not _scenes_of(file, empty)]
+    missing = [name for name, file in files.items() if not _scenes_made_as(_stored_bank(file), empty)]
     yield from (name for name in scenes if name not in missing)
     with worker_pool(max(1, min(workers, len(missing)))) as pool:
         running = {pool.submit(_observe_to_file, observe, name, files[name], empty): name for name in missing}
@@ -127,7 +133,8 @@ def build_bank(
             done.result()
             yield running[done]
     made = known | {name: load_bank(file).scenes[0] for name, file in files.items()}
-    replace(empty, scenes=[made[name] for name in scenes]).save(path)
+    others = [name for name in known if name not in scenes]
+    replace(empty, scenes=[made[name] for name in (*scenes, *others)]).save(path)
     for file in files.values():
         file.unlink()
     for folder in parts.glob(f"*{_VIEWS_SUFFIX}"):  # of another provenance
@@ -136,11 +143,17 @@ def build_bank(
         parts.rmdir()
 
 
-def _scenes_of(path: Path, like: "SceneBank") -> dict[str, BankScene]:
-    """The scenes of a complete bank that was made the same way as ``like``, by name; none otherwise."""
+def _stored_bank(path: Path) -> "SceneBank | None":
+    """The bank in a file; None if there is none, or none that can be read."""
     try:
-        bank = load_bank(path)
+        return load_bank(path)
     except ValueError:
+        return None
+
+
+def _scenes_made_as(bank: "SceneBank | None", like: "SceneBank") -> dict[str, BankScene]:
+    """The scenes of a bank that was made the same way as ``like``, by name; none otherwise."""
+    if bank is None:
         return {}
     made = bank.provenance, bank.sphere, bank.grid
     same = made == (json.loads(json.dumps(like.provenance)), like.sphere, like.grid)

@@ -110,7 +110,7 @@ class EpisodeState:
         decision = self._avoid_struck(observation, policy.decide(observation))
         if decision.stop:
             if observation.candidates().any():
-                return decision, "policy is content"
+                return decision, "the policy stopped: no view is worth the move"
             return decision, f"no reachable view is left{self._describe_struck()}"
         self._goal, self._waited = decision.position, 0.0
         return decision, ""

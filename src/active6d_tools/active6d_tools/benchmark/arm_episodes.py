@@ -116,7 +116,7 @@ def measure_arm(
     Returns:
         The settings, ``times``, and a row for each of ``policies``. Its ``found`` is the share after each move,
         ``found_at`` that at each of ``times``. ``refused`` goals and ``metres`` are per episode, and ``reasons`` has
-        the number of refusals for each reason.
+        the number of refusals for each reason. What is of moves is None for a policy that made none.
     """
     model, sphere = load_object(object_name), ViewSphere()
     runner = DirectRunner(model, Limits(sphere, np.ones(len(sphere), bool), steps))
@@ -154,6 +154,9 @@ def _describe(episode: DirectEpisode, camera: ArmCamera, sphere: ViewSphere) -> 
 
 def _summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
     seconds = np.concatenate([row["seconds"] for row in rows])
+    clearances = np.concatenate([row["clearances"] for row in rows])
+    # With a policy that takes one view, or where every goal is refused, nothing has moved.
+    moved = len(seconds) > 0
     reasons = [reason for row in rows for reason in row["refused"]]
     longest = max(len(row["found"]) for row in rows)
     # An episode that ended early keeps what it had found.
@@ -162,12 +165,12 @@ def _summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "moves": len(seconds),
         "found": found.mean(axis=0).tolist(),
         "found_at": np.mean([row["found_at"] for row in rows], axis=0).tolist(),
-        "seconds_per_move": float(seconds.mean()),
-        "seconds_median": float(np.median(seconds)),
-        "seconds_p95": float(np.quantile(seconds, 0.95)),
+        "seconds_per_move": float(seconds.mean()) if moved else None,
+        "seconds_median": float(np.median(seconds)) if moved else None,
+        "seconds_p95": float(np.quantile(seconds, 0.95)) if moved else None,
         "seconds_per_episode": float(np.mean([sum(row["seconds"]) for row in rows])),
         "metres": float(np.mean([row["metres"] for row in rows])),
         "refused": len(reasons) / len(rows),
         "reasons": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
-        "least_clearance_mm": 1e3 * float(min(min(row["clearances"]) for row in rows)),
+        "least_clearance_mm": 1e3 * float(clearances.min()) if moved else None,
     }

@@ -48,12 +48,12 @@ def arm(
             name,
             f"{row['found'][0]:.3f}",
             f"{row['found'][-1]:.3f}",
-            f"{row['seconds_per_move']:.1f}",
-            f"{row['seconds_p95']:.1f}",
+            _cell(row["seconds_per_move"], 1),
+            _cell(row["seconds_p95"], 1),
             f"{row['seconds_per_episode']:.1f}",
             f"{row['metres']:.2f}",
             f"{row['refused']:.1f}",
-            f"{row['least_clearance_mm']:.0f}",
+            _cell(row["least_clearance_mm"], 0),
         )
         for name, row in result["policies"].items()
     ]
@@ -64,3 +64,8 @@ def arm(
         lines = {name: (result["times"], row["found_at"]) for name, row in result["policies"].items()}
         draw_panels(png, title, [Panel("seconds of motion", "found", lines)])
     write_json(json_file, result)
+
+
+def _cell(value: float | None, digits: int) -> str:
+    """A number of the moves; a dash where none was made."""
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -26,6 +26,7 @@ def policy(
     length: Annotated[int | None, typer.Option(min=1, help=_LENGTH)] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help=_OUT)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in that folder.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Replace the training in that folder by a new one.")] = False,
     override: Annotated[
         list[str] | None,
         typer.Option(
@@ -41,7 +42,8 @@ def policy(
 ) -> None:
     """Train a policy on an object's train bank and keep the weights with the best result on its val bank.
 
-    Curves are drawn to DIR/curve.png during training.
+    Curves are drawn to DIR/curve.png during training. A folder that holds a training is refused without --resume or
+    --again.
 
     Example: [bold]active6d train policy --object mug --policy view-attention --export weights[/bold]
     """
@@ -54,7 +56,9 @@ def policy(
         raise ValueError(f"--policy '{name}' is not among {', '.join((*LEARNED, PAPER))}")
     folder = out or cache_folder("policies") / object_name / name
     groups = parse_overrides(override or [])
-    training = plan_training(name, folder, steps=steps, seed=seed, length=length, groups=groups, resume=resume)
+    training = plan_training(
+        name, folder, steps=steps, seed=seed, length=length, groups=groups, resume=resume, again=again
+    )
     paths = [find_bank(object_name, split, banks) for split in ("train", "val")]
     with messages.status("reading the banks"):
         lookups = [make_lookup(load_bank(path)) for path in paths]

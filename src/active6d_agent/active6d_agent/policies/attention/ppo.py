@@ -27,7 +27,8 @@ from active6d_agent.policies.attention.network import (
 )
 from active6d_agent.policies.attention.ppo_policy import PaperPolicy
 from active6d_agent.policies.registry import Observation
-from active6d_core.files import Checkpoints, append_line, atomic_file, make_folder, write_file
+from active6d_agent.policies.training_folder import begin_training
+from active6d_core.files import Checkpoints, append_line, atomic_file, write_file
 
 #: The paper's length of the training and its learning rate (supplement E); batch and discount are the usual ones here.
 AS_IN_THE_PAPER = {"total": 10_000_000, "learning_rate": 1e-4, "evaluate_every": 200_000}
@@ -169,6 +170,7 @@ def train_ppo(
     reward: RewardParameters | None = None,
     *,
     resume: bool = False,
+    again: bool = False,
 ) -> Iterator[Progress]:
     """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
 
@@ -182,12 +184,14 @@ def train_ppo(
         parameters: how to train.
         reward: weights and scales of the reward.
         resume: continue from ``latest``; all parameters but ``total`` must be the same as before.
+        again: replace the training that is in the folder.
 
     Raises:
-        ValueError: there is nothing to resume from, or with other parameters.
+        ValueError: there is nothing to resume from, or with other parameters, or a training that is neither to go on
+            nor to be replaced.
     """
     parameters, reward = parameters or PpoParameters(), reward or RewardParameters()
-    make_folder(folder)
+    begin_training(folder, resume=resume, again=again)
     ppo = _make_ppo(train, parameters, reward)
     identity = {"parameters": asdict(parameters) | {"total": 0}, "reward": asdict(reward)}
     curve, best, begun = folder / "curve.jsonl", (-1.0, 0.0), time.perf_counter()
@@ -195,8 +199,6 @@ def train_ppo(
     if resume:
         best, seconds, evaluated = _restore(ppo, folder, identity)
         begun -= seconds
-    else:
-        curve.unlink(missing_ok=True)
 
     def keep() -> None:
         state = {"best": best, "seconds": time.perf_counter() - begun, "evaluated": evaluated}
@@ -307,7 +309,7 @@ def _restore(ppo: PPO, folder: Path, identity: dict[str, Any]) -> tuple[tuple[fl
     # Parameters that did not exist when it was written had what is now their default.
     defaults = {"parameters": asdict(PpoParameters()), "reward": asdict(RewardParameters())}
     if any({**defaults[key], **state.get(key, {})} != value for key, value in identity.items()):
-        raise ValueError(f"{path}: was trained with other parameters; start again without resuming")
+        raise ValueError(f"{path}: was trained with other parameters; give these, or replace it with --again")
     ppo.policy.load_state_dict({k.removeprefix("policy."): v for k, v in tensors.items() if k.startswith("policy.")})
     adam: dict[int, dict[str, torch.Tensor]] = {}
     for key, value in tensors.items():

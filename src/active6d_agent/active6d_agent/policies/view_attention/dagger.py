@@ -23,6 +23,7 @@ from active6d_agent.environment.rollout import MEASURES, Choose, measure, roll_o
 from active6d_agent.evaluation.oracle import known
 from active6d_agent.evaluation.policy_evaluation import all_starts, run_named
 from active6d_agent.policies.registry import MAX_OBJECTS, Observation
+from active6d_agent.policies.training_folder import begin_training
 from active6d_agent.policies.view_attention.features import BELIEF, INFORMATION, SceneState, gather, represent
 from active6d_agent.policies.view_attention.network import (
     GAINS,
@@ -32,7 +33,7 @@ from active6d_agent.policies.view_attention.network import (
     save_network,
     value_views,
 )
-from active6d_core.files import Checkpoints, append_line, make_folder
+from active6d_core.files import Checkpoints, append_line
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
 
@@ -168,6 +169,7 @@ def train_dagger(
     weighing: Weighing | None = None,
     *,
     resume: bool = False,
+    again: bool = False,
 ) -> Iterator[DaggerProgress]:
     """Train, evaluate on the validation scenes, keep the best; yields the curve as it grows.
 
@@ -181,19 +183,18 @@ def train_dagger(
         parameters: how to train.
         weighing: of gains and travel, for the learner's moves.
         resume: go on from ``latest``, which is at most one round or some 20 s old, with newly collected states.
+        again: replace the training that is in the folder.
 
     Raises:
-        ValueError: there is nothing to resume from.
+        ValueError: there is nothing to resume from, or a training that is neither to go on nor to be replaced.
     """
     parameters, weighing = parameters or DaggerParameters(), weighing or Weighing()
-    make_folder(folder)
+    begin_training(folder, resume=resume, again=again)
     learner = _Learner(train, parameters, weighing)
     curve, latest, best, begun = folder / "curve.jsonl", folder / "latest.safetensors", (-1.0, 0.0), time.perf_counter()
     if resume:
         best, seconds = learner.restore(latest)
         begun -= seconds
-    else:
-        curve.unlink(missing_ok=True)
     starts = all_starts(validation, parameters.starts, parameters.seed)
     common = {"parameters": asdict(parameters), "bank": train.bank.provenance}
     checkpoints = Checkpoints()
