@@ -43,8 +43,8 @@ class TransformTree:
 
     def _insert(self, child: str, stamp: int, T_parent_child: np.ndarray) -> None:
         stamps, transforms = self._stamps[child], self._transforms[child]
-        limited = self._kept is not None and child not in self._static
-        if limited and stamps and stamp < stamps[-1] - self._kept:
+        kept = None if child in self._static else self._kept
+        if kept is not None and stamps and stamp < stamps[-1] - kept:
             stamps.clear()
             transforms.clear()
         position = bisect_left(stamps, stamp)
@@ -53,8 +53,8 @@ class TransformTree:
             return
         stamps.insert(position, stamp)
         transforms.insert(position, T_parent_child)
-        if limited:
-            old = bisect_left(stamps, stamps[-1] - self._kept)
+        if kept is not None:
+            old = bisect_left(stamps, stamps[-1] - kept)
             del stamps[:old], transforms[:old]
 
     def root(self, frame: str) -> str:
