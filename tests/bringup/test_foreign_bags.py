@@ -141,6 +141,20 @@ def test_a_lone_file_and_a_folder_without_metadata_are_read(tmp_path):
     assert_views(folder)
 
 
+def test_a_folder_without_metadata_is_foreign_even_if_its_topics_have_the_names_of_the_graph(tmp_path):
+    names = {
+        COLOR: "/camera/color/image_raw",
+        DEPTH: "/camera/depth/image_raw",
+        INFO: "/camera/color/camera_info",
+        POSE: "/camera/pose",
+    }
+    folder = write(tmp_path / "bag", [(at, names[topic], message) for at, topic, message in driver_messages()])
+    (folder / "metadata.yaml").unlink()
+    index = assert_views(folder)  # colour, depth and poses have stamps of their own
+    assert index.source
+    assert index.left_out == {}
+
+
 def test_a_ros_1_bag_is_read(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     with Writer1(tmp_path / "old.bag") as writer:
