@@ -228,6 +228,10 @@ PROBLEMS = {
     "no stamps": (Traits(unstamped=("color",)), "stamps on driver/color are 0"),
     "no stamps of poses": (Traits(unstamped=("pose",)), "stamps on driver/pose are 0"),
     "clocks": (Traits(pose_lag=40 * SECOND), "do both use the same clock"),
+    "clocks, poses behind": (
+        Traits(pose_lag=-40 * SECOND),
+        "the newest camera pose is 40.0 s older than the newest image: their clocks differ, or poses come late",
+    ),
     "no info": (Traits(parameters={"info_topic": "driver/other"}), "no camera_info comes on driver/other"),
     "type": (
         Traits(parameters={"color_topic": "driver/pose"}),

@@ -220,6 +220,19 @@ def test_a_skew_beyond_the_tolerance_is_measured():
     assert preflight.check_skew(matcher.skew, 6_000_000) == expected
 
 
+@pytest.mark.parametrize(
+    ("lag", "full", "said"),
+    [
+        (40 * SECOND, False, True),  # a camera that is triggered: few images wait
+        (SECOND // 2, True, True),  # poses come too late for a fast stream
+        (SECOND // 8, False, False),  # between two poses
+        (SECOND // 100, True, False),
+    ],
+)
+def test_poses_behind_the_images_are_said_when_images_wait_in_vain(lag, full, said):
+    assert ("their clocks differ" in preflight.check_pose_lag(lag, 50_000_000, full)) == said
+
+
 class Arm:
     """A camera that moves to where it is sent in one second, seen by a gate at 30 Hz."""
 

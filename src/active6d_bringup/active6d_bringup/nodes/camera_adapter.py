@@ -8,7 +8,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 
-from active6d_bringup.camera.preflight import check_pose_rate, check_pose_stamp, check_skew
+from active6d_bringup.camera.preflight import check_pose_lag, check_pose_rate, check_pose_stamp, check_skew
 from active6d_bringup.camera.stream import SECOND, ArrivalGate, FrameMatcher, GateLimits, PoseHistory, Verdict
 from active6d_bringup.camera.view_maker import ViewMaker
 from active6d_bringup.nodes.driver_inputs import DriverInputs
@@ -256,6 +256,9 @@ class CameraAdapterNode(GraphNode):
             window = round(self._limits.still_seconds * SECOND)
             recent = self._poses.between(self._poses.newest - window, self._poses.newest)
             self.say_once(check_pose_rate(len(recent), self._limits.still_seconds))
+            if self._pending:
+                lag = self._pending[-1][0] - self._poses.newest
+                self.say_once(check_pose_lag(lag, self._pose_tolerance, len(self._pending) == _PENDING))
 
     def _why_no_pose(self) -> str:
         topic = self.value("pose_topic")
