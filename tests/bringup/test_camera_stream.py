@@ -233,6 +233,55 @@ def test_poses_behind_the_images_are_said_when_images_wait_in_vain(lag, full, sa
     assert ("their clocks differ" in preflight.check_pose_lag(lag, 50_000_000, full)) == said
 
 
+class Counting(int):
+    """A stamp that counts how often it is compared or subtracted."""
+
+    looks = 0
+
+    def _look(self, other, calculate):
+        Counting.looks += 1
+        return calculate(self, other)
+
+    def __lt__(self, other):
+        return self._look(other, int.__lt__)
+
+    def __gt__(self, other):
+        return self._look(other, int.__gt__)
+
+    def __le__(self, other):
+        return self._look(other, int.__le__)
+
+    def __sub__(self, other):
+        return self._look(other, int.__sub__)
+
+
+def test_a_pose_of_a_long_recording_is_found_without_looking_at_all():
+    rng = np.random.default_rng(3)
+    stamps = np.cumsum(rng.integers(0, 20, 5000)).tolist()  # some repeat
+    history = PoseHistory(keep=None)
+    for number, stamp in enumerate(stamps):
+        history.add(Counting(stamp), np.full((4, 4), number))
+    Counting.looks = 0
+    for stamp in rng.integers(-50, stamps[-1] + 50, 100).tolist():
+        at, T = history.nearest(stamp)
+        assert abs(at - stamp) == min(abs(each - stamp) for each in stamps)
+        assert stamps[int(T[0, 0])] == at
+        found = [int(T[0, 0]) for T in history.between(stamp, stamp + 100)]
+        assert found == [number for number, each in enumerate(stamps) if stamp <= each <= stamp + 100]
+    assert Counting.looks < 100 * 100
+    assert PoseHistory().nearest(0) is None
+    assert PoseHistory().between(0, 1) == []
+
+
+def test_a_live_history_keeps_the_last_poses_and_begins_again_when_the_clock_goes_back():
+    history = PoseHistory(keep=3)
+    for stamp in range(5):
+        history.add(stamp, np.full((4, 4), stamp))
+    assert (len(history), history.newest, history.nearest(0)[0]) == (3, 4, 2)
+    history.add(1, np.eye(4))
+    assert (len(history), history.newest) == (1, 1)
+
+
 class Arm:
     """A camera that moves to where it is sent in one second, seen by a gate at 30 Hz."""
 
