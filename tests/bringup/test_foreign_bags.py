@@ -1,6 +1,9 @@
 """Recordings of other programs: every storage, transport and naming is read, or refused with its cause."""
 
+import shutil
+import sqlite3
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,7 +16,7 @@ from simulated_driver import plane_view
 from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.index import read_bag
 from active6d_bringup.bags.reader import read_episodes
-from active6d_bringup.bags.repair import repair
+from active6d_bringup.bags.repair import Repaired, repair
 from active6d_bringup.bags.source import BagError
 from active6d_bringup.bags.summary import summarise
 from active6d_bringup.bags.writer import TYPESTORE
@@ -527,16 +530,41 @@ def test_compressed_recordings_are_read_and_without_metadata_read_or_refused_wit
                 read_bag(path)
 
 
-def test_a_cut_sqlite3_file_is_repaired(tmp_path):
+def test_a_cut_sqlite3_file_is_repaired(tmp_path, monkeypatch):
     bag = write(tmp_path / "bag", driver_messages(), StoragePlugin.SQLITE3)
     file = next(bag.glob("*.db3"))
     file.write_bytes(file.read_bytes()[: int(0.9 * file.stat().st_size)])
     with pytest.raises(BagError, match="active6d bag repair"):
         read_bag(bag)
-    saved = repair(bag, tmp_path / "saved")
+    with monkeypatch.context() as patch:
+        patch.delattr(Path, "read_bytes")  # a bag may be larger than the memory
+        saved = repair(bag, tmp_path / "saved")
     assert 0 < saved.messages < 12
     assert "ends early" in saved.damage[0]
     assert summarise(tmp_path / "saved").messages == saved.messages
+
+
+def test_messages_in_the_log_of_a_killed_sqlite3_recording_are_saved(tmp_path):
+    bag = write(tmp_path / "bag", driver_messages(), StoragePlugin.SQLITE3)
+    file, killed = next(bag.glob("*.db3")), tmp_path / "killed"
+    killed.mkdir()
+    database = sqlite3.connect(file)
+    rows = database.execute("SELECT topic_id, timestamp, data FROM messages WHERE id > 4").fetchall()
+    database.execute("DELETE FROM messages WHERE id > 4")
+    database.commit()
+    database.execute("PRAGMA journal_mode=WAL")
+    database.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+    database.commit()
+    for path in (file, file.with_name(f"{file.name}-wal")):  # the log goes when its database is closed
+        shutil.copyfile(path, killed / path.name)
+    database.close()
+    before = {path.name: path.read_bytes() for path in killed.iterdir()}
+    for path in (killed, killed / file.name):
+        with pytest.raises(BagError, match=r"messages are in bag.db3-wal and not in the bag yet.*active6d bag repair"):
+            read_bag(path)
+    assert repair(killed, tmp_path / "saved") == Repaired(12, ())
+    assert_views(tmp_path / "saved")
+    assert {path.name: path.read_bytes() for path in killed.iterdir()} == before
 
 
 def test_what_repair_cannot_do_is_said_by_the_reader_too(tmp_path):

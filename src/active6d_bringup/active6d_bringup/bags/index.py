@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.mcap_file import McapFile, RecordedMessage
 from active6d_bringup.bags.recorded_camera import import_camera
-from active6d_bringup.bags.source import BagError, damaged
+from active6d_bringup.bags.source import BagError, damaged, refuse_unfinished
 from active6d_bringup.bags.writer import ACTIVE6D, CHECKSUM, INFORMATION, SETTINGS, TYPESTORE, file_number, stamp_of
 from active6d_core.calibration import Calibration
 from active6d_core.ros.conversions import COLOR_ENCODINGS
@@ -241,6 +241,7 @@ def _read_mcap(
 
 def _read_with_rosbags(folder: Path) -> list[RecordedMessage]:
     """The messages of a bag in another storage than plain MCAP, in order of time."""
+    refuse_unfinished(folder)
     try:
         with Reader(folder) as reader:
             return [

@@ -10,7 +10,7 @@ from pathlib import Path
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from active6d_bringup.bags.mcap_file import McapFile, RecordedMessage
-from active6d_bringup.bags.source import BagError, find_files, open_source
+from active6d_bringup.bags.source import LOG, BagError, find_files, open_source
 from active6d_bringup.bags.writer import TYPESTORE, file_number
 
 _SQLITE, _SQLITE_HEADER = b"SQLite format 3", 100
@@ -72,16 +72,21 @@ def _messages(file: Path, damage: list[str]) -> Iterator[RecordedMessage]:
 
 
 def _rows(file: Path, damage: list[str]) -> Iterator[RecordedMessage]:
-    """The messages of a cut sqlite3 file, as far as it goes."""
+    """The messages of a cut sqlite3 file, as far as it goes, and of its write-ahead log."""
     with tempfile.TemporaryDirectory() as folder:
-        # SQLite opens no file that is shorter than its header says.
-        whole, header = Path(folder) / file.name, file.read_bytes()[:_SQLITE_HEADER]
+        whole, log = Path(folder) / file.name, file.with_name(file.name + LOG)
         shutil.copyfile(file, whole)
+        # SQLite puts a log that it finds beside a file into the file: both are copies.
+        if log.is_file():
+            shutil.copyfile(log, whole.with_name(log.name))
+        with file.open("rb") as original:
+            header = original.read(_SQLITE_HEADER)
+        # SQLite opens no file that is shorter than its header says.
         if header.startswith(_SQLITE):
             page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
             with whole.open("r+b") as copy:
                 copy.truncate(max(page * pages, file.stat().st_size))
-        database = sqlite3.connect(f"{whole.as_uri()}?immutable=1", uri=True)
+        database = sqlite3.connect(whole)
         try:
             topics = {key: (name, kind) for key, name, kind in database.execute("SELECT id, name, type FROM topics")}
             for key, received, payload in database.execute(
