@@ -2,6 +2,7 @@
 
 import shutil
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from simulated_driver import plane_view
 
 from active6d_bringup.bags.camera_topics import CameraOptions
@@ -565,6 +566,69 @@ def test_messages_in_the_log_of_a_killed_sqlite3_recording_are_saved(tmp_path):
     assert repair(killed, tmp_path / "saved") == Repaired(12, ())
     assert_views(tmp_path / "saved")
     assert {path.name: path.read_bytes() for path in killed.iterdir()} == before
+
+
+METADATA, DRIVERS_TYPE = "/driver/color/metadata", "driver_msgs/msg/Metadata"
+DEFINITION = "std_msgs/Header header\nstring json\n"
+
+
+def without_definitions(bag):
+    """Remove the definitions from a sqlite3 bag, as recorders of before ROS 2 Iron leave it."""
+    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as database:
+        database.execute("DELETE FROM message_definitions")
+        database.commit()
+
+
+@pytest.fixture(params=["defined", "not defined"])
+def custom(request, tmp_path):
+    """A whole sqlite3 bag with a type of the driver's own, and whether its definition is in the bag."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(DEFINITION, DRIVERS_TYPE))
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections = {}
+        for arrival, topic, message in driver_messages():
+            kind = type_of(message)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], arrival, store.serialize_cdr(message, kind))
+        connection = writer.add_connection(METADATA, DRIVERS_TYPE, typestore=store)
+        message = store.types[DRIVERS_TYPE](header(103 * SECOND, FRAME), "{}")
+        writer.write(connection, 103 * SECOND, store.serialize_cdr(message, DRIVERS_TYPE))
+    if request.param == "not defined":
+        without_definitions(tmp_path / "bag")
+    return tmp_path / "bag", request.param == "defined"
+
+
+def test_a_type_without_definition_is_no_damage_and_is_kept_by_repair(tmp_path, custom):
+    bag, defined = custom
+    saved = repair(bag, tmp_path / "saved")
+    assert saved == Repaired(13, ())
+    for folder in (bag, tmp_path / "saved"):
+        summary = summarise(folder)
+        row = next(row for row in summary.topics if row.name == METADATA)
+        assert (summary.messages, row.count, row.type) == (13, 1, DRIVERS_TYPE)
+        assert (row.frame, row.content) == ((FRAME, "") if defined else ("", "definition not in the bag"))
+        assert_views(folder)
+    payloads = []
+    for folder in (bag, tmp_path / "saved"):
+        with Reader(folder) as reader:
+            payloads.append({(each.topic, at, bytes(payload)) for each, at, payload in reader.messages()})
+    assert payloads[0] == payloads[1]
+
+
+def test_repair_saves_every_message_of_a_damaged_sqlite3_file_once(tmp_path):
+    messages = [(at + 10 * lap * SECOND, *rest) for lap in range(5) for at, *rest in driver_messages()]
+    bag = write(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
+    file = next(bag.glob("*.db3"))
+    data = bytearray(file.read_bytes())
+    page = next(at for at in range(len(data) // 2, len(data), 4096) if data[at] == 0)
+    data[page : page + 4096] = bytes(4096)  # the middle of an image, so that only its row cannot be read
+    file.write_bytes(data)
+    saved = repair(bag, tmp_path / "saved")
+    assert "ends early or is damaged" in saved.damage[0]
+    with Reader(tmp_path / "saved") as reader:
+        found = [(each.topic, at) for each, at, _ in reader.messages()]
+    assert 12 <= len(set(found)) == len(found) == saved.messages
 
 
 def test_what_repair_cannot_do_is_said_by_the_reader_too(tmp_path):

@@ -58,6 +58,11 @@ class McapFile:
             (each.topic, self._schemas[each.schema_id].name) for each in channels if each.schema_id in self._schemas
         }
 
+    def definition(self, message_type: str) -> tuple[str, str]:
+        """Encoding and text of a type's definition, of the types read so far; empty where the file has none."""
+        found = next((each for each in self._schemas.values() if each.name == message_type), None)
+        return ("", "") if found is None else (found.encoding, found.data.decode(errors="replace"))
+
     def begins_with(self, name: str) -> bool:
         """Whether a metadata record of this name comes first in the file, before any message."""
         with self.path.open("rb") as file:

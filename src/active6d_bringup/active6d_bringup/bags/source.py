@@ -43,6 +43,10 @@ class BagSource:
         """The definitions of its messages."""
         return self._reader.typestore
 
+    def knows(self, message_type: str) -> bool:
+        """Whether messages of a type can be decoded: it is defined in the recording, or standard in one without any."""
+        return message_type in self.typestore.types
+
     def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
         """Connection, time of recording (ns) and serialized message, in order of recording."""
         if not connections:
