@@ -117,7 +117,7 @@ def _may_be_of_the_contract(path: Path) -> bool:
 
 def _read_own(path: Path) -> tuple[BagIndex | None, tuple[str, ...]]:
     """The bag's topics of the contract, None where its camera is not what the graph publishes; and the damage."""
-    # A lone file is whole without metadata.yaml, which speaks of the other files of a bag, too.
+    # metadata.yaml describes all files of a bag: a lone file is whole without it.
     metadata, damage = _read_metadata(path) if path.is_dir() else ({}, [])
     if metadata.get("storage_identifier", "mcap") == "mcap" and not metadata.get("compression_mode"):
         messages, recorded, settings, lines = _read_mcap(path, metadata)
