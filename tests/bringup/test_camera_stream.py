@@ -11,7 +11,7 @@ from simulated_driver import look
 from active6d_bringup.camera import preflight
 from active6d_bringup.camera.depth_registration import register_depth
 from active6d_bringup.camera.driver_images import decode_color, decode_depth
-from active6d_bringup.camera.rectification import Rectifier
+from active6d_bringup.camera.rectification import RECTIFIED, Rectifier, are_rectified
 from active6d_bringup.camera.stream import SECOND, ArrivalGate, FrameMatcher, GateLimits, PoseHistory, Verdict
 from active6d_core.calibration import Calibration
 from active6d_core.camera import PinholeCamera, backproject
@@ -100,6 +100,26 @@ def test_images_without_distortion_and_rectified_ones_pass_unchanged():
     )
     assert Rectifier(bent, rectified=True).color(image) is image
     assert Rectifier(bent, rectified=True).camera.fx == pytest.approx(135)
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/camera/image_rect", True),
+        ("/camera/image_rect_color/compressed", True),
+        ("camera/rgb/image_rectified", True),
+        ("/zed/rgb/color/rect/image", True),
+        ("rect", True),
+        ("/camera/color/image_raw", False),
+        ("/camera/image_color_corrected", False),
+        ("/camera/direct_image", False),
+        ("/camera/direct/image_raw/compressed", False),
+    ],
+)
+def test_the_word_rect_in_a_topics_name_says_that_its_images_are_rectified(topic, rectified):
+    assert are_rectified(RECTIFIED["auto"], topic) == rectified
+    assert are_rectified(RECTIFIED["yes"], topic)
+    assert not are_rectified(RECTIFIED["no"], topic)
 
 
 @pytest.mark.parametrize(

@@ -328,6 +328,13 @@ def test_distortion_that_was_left_in_camera_info_is_said_and_can_be_switched_off
     bag = write(tmp_path / "bag", with_infos(distort))
     assert any("if they are already, say so" in note for note in read_bag(bag).notes)
     assert not assert_views(bag, CameraOptions(rectified=True)).notes
+    by_name = [
+        (at, topic.replace("color/image_raw", "color/image_rect_color"), message)
+        for at, topic, message in with_infos(distort)
+    ]
+    named = write(tmp_path / "named", by_name)
+    assert not assert_views(named).notes
+    assert any("if they are already, say so" in note for note in read_bag(named, CameraOptions(rectified=False)).notes)
 
 
 def test_floating_point_millimetres_are_recognised(tmp_path):

@@ -14,6 +14,7 @@ import numpy as np
 from active6d_bringup.bags.camera_topics import INFO, TRANSFORMS, CameraOptions, CameraTopics, find_camera, with_options
 from active6d_bringup.bags.source import BagError, BagSource, open_source
 from active6d_bringup.bags.writer import TYPESTORE
+from active6d_bringup.camera.rectification import are_rectified
 from active6d_bringup.camera.stream import (
     SECOND,
     ArrivalGate,
@@ -99,7 +100,7 @@ def import_camera(path: Path, options: CameraOptions = CameraOptions()) -> Recor
             world = "world" if scan.tree.has("world") else scan.tree.root(scan.color_frame)
             topics = replace(topics, world=world)
         chosen = list(_choose_views(scan, topics, left_out))
-        maker = ViewMaker(options.depth_scale, options.rectified)
+        maker = ViewMaker(options.depth_scale, are_rectified(options.rectified, topics.color))
         payloads: dict[str, dict[int, bytes]] = defaultdict(dict)
         received: dict[str, dict[int, int]] = defaultdict(dict)
         notes = ["header stamps are missing or go back: times of recording are used"] if scan.by_arrival else []
