@@ -112,6 +112,21 @@ def test_a_recording_without_metadata_is_read_and_says_so(tmp_path):
     assert record.damage == ("there is no metadata.yaml: the recording was killed, or its file was moved",)
 
 
+@pytest.mark.parametrize("ended", [True, False])
+def test_the_file_of_a_bag_is_read_as_the_bag(tmp_path, ended):
+    folder = write_bag(tmp_path / "bag", StubEpisode(seed=5, moves=2).messages())
+    file, whole = folder / "bag.mcap", read_episode(folder)
+    if not ended:
+        file.write_bytes(file.read_bytes()[:-8])
+    record = read_episode(file)
+    assert record.info == whole.info
+    assert record.end_reason == whole.end_reason
+    np.testing.assert_array_equal(record.ground_truth, whole.ground_truth)
+    assert [len(step.objects) for step in record.steps] == [len(step.objects) for step in whole.steps]
+    assert all(step.hypotheses is not None for step in record.steps)
+    assert bool(record.damage) != ended
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A bag, and where its chunks end."""

@@ -174,6 +174,19 @@ def test_distorted_colour_and_depth_are_rectified(graph):
     assert np.abs(found - plane_view(CAMERA, POSES[0]).depth)[valid].max() < 0.012
 
 
+@pytest.mark.parametrize(
+    ("name", "rectified"), [("image_rect_color/compressed", True), ("image_color_corrected", False)]
+)
+def test_images_are_rectified_unless_the_name_of_their_topic_says_that_they_are(graph, name, rectified):
+    info = camera_to_info(CAMERA, SECOND, FRAME)
+    info.d = [-0.12, 0.05, 0.002, -0.001, 0.01]
+    cell = Cell(graph, Traits(info=info), parameters={"color_topic": f"driver/{name}"})
+    cell.driver.color = graph.node.create_publisher(Image, f"driver/{name}", 10)
+    cell.first_view()
+    graph.spin_for(0.1)
+    assert bool(cell.said("camera_info has distortion")) != rectified
+
+
 def test_unregistered_depth_is_registered_by_the_parameter(graph):
     T_color_depth = make_transform(np.eye(3), np.array([-0.05, 0.0, 0.0]))
     depth_camera = PinholeCamera(212, 120, 110.0, 110.0, 105.5, 59.5)
@@ -228,6 +241,10 @@ PROBLEMS = {
     "no stamps": (Traits(unstamped=("color",)), "stamps on driver/color are 0"),
     "no stamps of poses": (Traits(unstamped=("pose",)), "stamps on driver/pose are 0"),
     "clocks": (Traits(pose_lag=40 * SECOND), "do both use the same clock"),
+    "clocks, poses behind": (
+        Traits(pose_lag=-40 * SECOND),
+        "the newest camera pose is 40.0 s older than the newest image: their clocks differ, or poses come late",
+    ),
     "no info": (Traits(parameters={"info_topic": "driver/other"}), "no camera_info comes on driver/other"),
     "type": (
         Traits(parameters={"color_topic": "driver/pose"}),

@@ -11,7 +11,7 @@ from simulated_driver import look
 from active6d_bringup.camera import preflight
 from active6d_bringup.camera.depth_registration import register_depth
 from active6d_bringup.camera.driver_images import decode_color, decode_depth
-from active6d_bringup.camera.rectification import Rectifier
+from active6d_bringup.camera.rectification import RECTIFIED, Rectifier, are_rectified
 from active6d_bringup.camera.stream import SECOND, ArrivalGate, FrameMatcher, GateLimits, PoseHistory, Verdict
 from active6d_core.calibration import Calibration
 from active6d_core.camera import PinholeCamera, backproject
@@ -100,6 +100,26 @@ def test_images_without_distortion_and_rectified_ones_pass_unchanged():
     )
     assert Rectifier(bent, rectified=True).color(image) is image
     assert Rectifier(bent, rectified=True).camera.fx == pytest.approx(135)
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/camera/image_rect", True),
+        ("/camera/image_rect_color/compressed", True),
+        ("camera/rgb/image_rectified", True),
+        ("/zed/rgb/color/rect/image", True),
+        ("rect", True),
+        ("/camera/color/image_raw", False),
+        ("/camera/image_color_corrected", False),
+        ("/camera/direct_image", False),
+        ("/camera/direct/image_raw/compressed", False),
+    ],
+)
+def test_the_word_rect_in_a_topics_name_says_that_its_images_are_rectified(topic, rectified):
+    assert are_rectified(RECTIFIED["auto"], topic) == rectified
+    assert are_rectified(RECTIFIED["yes"], topic)
+    assert not are_rectified(RECTIFIED["no"], topic)
 
 
 @pytest.mark.parametrize(
@@ -218,6 +238,68 @@ def test_a_skew_beyond_the_tolerance_is_measured():
         matcher.add("depth", index * 66_000_000 + 12_000_000, index)
     expected = "stamps of colour and depth differ by 12 ms: set stamp_tolerance to 0.013"
     assert preflight.check_skew(matcher.skew, 6_000_000) == expected
+
+
+@pytest.mark.parametrize(
+    ("lag", "full", "said"),
+    [
+        (40 * SECOND, False, True),  # a camera that is triggered: few images wait
+        (SECOND // 2, True, True),  # poses come too late for a fast stream
+        (SECOND // 8, False, False),  # between two poses
+        (SECOND // 100, True, False),
+    ],
+)
+def test_poses_behind_the_images_are_said_when_images_wait_in_vain(lag, full, said):
+    assert ("their clocks differ" in preflight.check_pose_lag(lag, 50_000_000, full)) == said
+
+
+class Counting(int):
+    """A stamp that counts how often it is compared or subtracted."""
+
+    looks = 0
+
+    def _look(self, other, calculate):
+        Counting.looks += 1
+        return calculate(self, other)
+
+    def __lt__(self, other):
+        return self._look(other, int.__lt__)
+
+    def __gt__(self, other):
+        return self._look(other, int.__gt__)
+
+    def __le__(self, other):
+        return self._look(other, int.__le__)
+
+    def __sub__(self, other):
+        return self._look(other, int.__sub__)
+
+
+def test_a_pose_of_a_long_recording_is_found_without_looking_at_all():
+    rng = np.random.default_rng(3)
+    stamps = np.cumsum(rng.integers(0, 20, 5000)).tolist()  # some repeat
+    history = PoseHistory(keep=None)
+    for number, stamp in enumerate(stamps):
+        history.add(Counting(stamp), np.full((4, 4), number))
+    Counting.looks = 0
+    for stamp in rng.integers(-50, stamps[-1] + 50, 100).tolist():
+        at, T = history.nearest(stamp)
+        assert abs(at - stamp) == min(abs(each - stamp) for each in stamps)
+        assert stamps[int(T[0, 0])] == at
+        found = [int(T[0, 0]) for T in history.between(stamp, stamp + 100)]
+        assert found == [number for number, each in enumerate(stamps) if stamp <= each <= stamp + 100]
+    assert Counting.looks < 100 * 100
+    assert PoseHistory().nearest(0) is None
+    assert PoseHistory().between(0, 1) == []
+
+
+def test_a_live_history_keeps_the_last_poses_and_begins_again_when_the_clock_goes_back():
+    history = PoseHistory(keep=3)
+    for stamp in range(5):
+        history.add(stamp, np.full((4, 4), stamp))
+    assert (len(history), history.newest, history.nearest(0)[0]) == (3, 4, 2)
+    history.add(1, np.eye(4))
+    assert (len(history), history.newest) == (1, 1)
 
 
 class Arm:

@@ -1,19 +1,23 @@
 """Recordings of other programs: every storage, transport and naming is read, or refused with its cause."""
 
+import shutil
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from simulated_driver import plane_view
 
 from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.index import read_bag
 from active6d_bringup.bags.reader import read_episodes
-from active6d_bringup.bags.repair import repair
+from active6d_bringup.bags.repair import Repaired, repair
 from active6d_bringup.bags.source import BagError
 from active6d_bringup.bags.summary import summarise
 from active6d_bringup.bags.writer import TYPESTORE
@@ -139,6 +143,20 @@ def test_a_lone_file_and_a_folder_without_metadata_are_read(tmp_path):
     assert_views(next(folder.glob("*.mcap")))
     (folder / "metadata.yaml").unlink()
     assert_views(folder)
+
+
+def test_a_folder_without_metadata_is_foreign_even_if_its_topics_have_the_names_of_the_graph(tmp_path):
+    names = {
+        COLOR: "/camera/color/image_raw",
+        DEPTH: "/camera/depth/image_raw",
+        INFO: "/camera/color/camera_info",
+        POSE: "/camera/pose",
+    }
+    folder = write(tmp_path / "bag", [(at, names[topic], message) for at, topic, message in driver_messages()])
+    (folder / "metadata.yaml").unlink()
+    index = assert_views(folder)  # colour, depth and poses have stamps of their own
+    assert index.source
+    assert index.left_out == {}
 
 
 def test_a_ros_1_bag_is_read(tmp_path):
@@ -310,6 +328,13 @@ def test_distortion_that_was_left_in_camera_info_is_said_and_can_be_switched_off
     bag = write(tmp_path / "bag", with_infos(distort))
     assert any("if they are already, say so" in note for note in read_bag(bag).notes)
     assert not assert_views(bag, CameraOptions(rectified=True)).notes
+    by_name = [
+        (at, topic.replace("color/image_raw", "color/image_rect_color"), message)
+        for at, topic, message in with_infos(distort)
+    ]
+    named = write(tmp_path / "named", by_name)
+    assert not assert_views(named).notes
+    assert any("if they are already, say so" in note for note in read_bag(named, CameraOptions(rectified=False)).notes)
 
 
 def test_floating_point_millimetres_are_recognised(tmp_path):
@@ -513,16 +538,104 @@ def test_compressed_recordings_are_read_and_without_metadata_read_or_refused_wit
                 read_bag(path)
 
 
-def test_a_cut_sqlite3_file_is_repaired(tmp_path):
+def test_a_cut_sqlite3_file_is_repaired(tmp_path, monkeypatch):
     bag = write(tmp_path / "bag", driver_messages(), StoragePlugin.SQLITE3)
     file = next(bag.glob("*.db3"))
     file.write_bytes(file.read_bytes()[: int(0.9 * file.stat().st_size)])
     with pytest.raises(BagError, match="active6d bag repair"):
         read_bag(bag)
-    saved = repair(bag, tmp_path / "saved")
+    with monkeypatch.context() as patch:
+        patch.delattr(Path, "read_bytes")  # a bag may be larger than the memory
+        saved = repair(bag, tmp_path / "saved")
     assert 0 < saved.messages < 12
     assert "ends early" in saved.damage[0]
     assert summarise(tmp_path / "saved").messages == saved.messages
+
+
+def test_messages_in_the_log_of_a_killed_sqlite3_recording_are_saved(tmp_path):
+    bag = write(tmp_path / "bag", driver_messages(), StoragePlugin.SQLITE3)
+    file, killed = next(bag.glob("*.db3")), tmp_path / "killed"
+    killed.mkdir()
+    database = sqlite3.connect(file)
+    rows = database.execute("SELECT topic_id, timestamp, data FROM messages WHERE id > 4").fetchall()
+    database.execute("DELETE FROM messages WHERE id > 4")
+    database.commit()
+    database.execute("PRAGMA journal_mode=WAL")
+    database.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+    database.commit()
+    for path in (file, file.with_name(f"{file.name}-wal")):  # the log goes when its database is closed
+        shutil.copyfile(path, killed / path.name)
+    database.close()
+    before = {path.name: path.read_bytes() for path in killed.iterdir()}
+    for path in (killed, killed / file.name):
+        with pytest.raises(BagError, match=r"messages are in bag.db3-wal and not in the bag yet.*active6d bag repair"):
+            read_bag(path)
+    assert repair(killed, tmp_path / "saved") == Repaired(12, ())
+    assert_views(tmp_path / "saved")
+    assert {path.name: path.read_bytes() for path in killed.iterdir()} == before
+
+
+METADATA, DRIVERS_TYPE = "/driver/color/metadata", "driver_msgs/msg/Metadata"
+DEFINITION = "std_msgs/Header header\nstring json\n"
+
+
+def without_definitions(bag):
+    """Remove the definitions from a sqlite3 bag, as recorders of before ROS 2 Iron leave it."""
+    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as database:
+        database.execute("DELETE FROM message_definitions")
+        database.commit()
+
+
+@pytest.fixture(params=["defined", "not defined"])
+def custom(request, tmp_path):
+    """A whole sqlite3 bag with a type of the driver's own, and whether its definition is in the bag."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(DEFINITION, DRIVERS_TYPE))
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections = {}
+        for arrival, topic, message in driver_messages():
+            kind = type_of(message)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], arrival, store.serialize_cdr(message, kind))
+        connection = writer.add_connection(METADATA, DRIVERS_TYPE, typestore=store)
+        message = store.types[DRIVERS_TYPE](header(103 * SECOND, FRAME), "{}")
+        writer.write(connection, 103 * SECOND, store.serialize_cdr(message, DRIVERS_TYPE))
+    if request.param == "not defined":
+        without_definitions(tmp_path / "bag")
+    return tmp_path / "bag", request.param == "defined"
+
+
+def test_a_type_without_definition_is_no_damage_and_is_kept_by_repair(tmp_path, custom):
+    bag, defined = custom
+    saved = repair(bag, tmp_path / "saved")
+    assert saved == Repaired(13, ())
+    for folder in (bag, tmp_path / "saved"):
+        summary = summarise(folder)
+        row = next(row for row in summary.topics if row.name == METADATA)
+        assert (summary.messages, row.count, row.type) == (13, 1, DRIVERS_TYPE)
+        assert (row.frame, row.content) == ((FRAME, "") if defined else ("", "definition not in the bag"))
+        assert_views(folder)
+    payloads = []
+    for folder in (bag, tmp_path / "saved"):
+        with Reader(folder) as reader:
+            payloads.append({(each.topic, at, bytes(payload)) for each, at, payload in reader.messages()})
+    assert payloads[0] == payloads[1]
+
+
+def test_repair_saves_every_message_of_a_damaged_sqlite3_file_once(tmp_path):
+    messages = [(at + 10 * lap * SECOND, *rest) for lap in range(5) for at, *rest in driver_messages()]
+    bag = write(tmp_path / "bag", messages, StoragePlugin.SQLITE3)
+    file = next(bag.glob("*.db3"))
+    data = bytearray(file.read_bytes())
+    page = next(at for at in range(len(data) // 2, len(data), 4096) if data[at] == 0)
+    data[page : page + 4096] = bytes(4096)  # the middle of an image, so that only its row cannot be read
+    file.write_bytes(data)
+    saved = repair(bag, tmp_path / "saved")
+    assert "ends early or is damaged" in saved.damage[0]
+    with Reader(tmp_path / "saved") as reader:
+        found = [(each.topic, at) for each, at, _ in reader.messages()]
+    assert 12 <= len(set(found)) == len(found) == saved.messages
 
 
 def test_what_repair_cannot_do_is_said_by_the_reader_too(tmp_path):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from active6d_bringup.bags.source import BagError, BagSource
+from active6d_bringup.camera.rectification import RECTIFIED
 from active6d_core.calibration import Calibration
 from active6d_core.ros.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_INFO, CAMERA_POSE
 
@@ -43,15 +44,15 @@ class CameraOptions:
     Attributes:
         topics: names that replace what would be found, by the keys of ``KEYS``.
         depth_scale: metres per unit of depth, 0 for what REP-118 says.
-        rectified: images are rectified already, whatever camera_info says.
+        rectified: whether images are rectified already, None for what the name of the colour topic says.
     """
 
     topics: dict[str, str] = field(default_factory=dict)
     depth_scale: float = 0.0
-    rectified: bool = False
+    rectified: bool | None = None
 
     @classmethod
-    def parse(cls, topics: str, depth_scale: float = 0.0, rectified: bool = False) -> "CameraOptions":
+    def parse(cls, topics: str, depth_scale: float = 0.0, rectified: bool | None = None) -> "CameraOptions":
         """From a text such as ``color=/left/image,depth=/left/depth``.
 
         Raises:
@@ -69,7 +70,8 @@ class CameraOptions:
     def parameters(self) -> dict[str, Any]:
         """The same as parameters of the node ``bag_player``."""
         topics = ",".join(f"{key}={name}" for key, name in self.topics.items())
-        return {"topics": topics, "depth_scale": self.depth_scale, "rectified": self.rectified}
+        rectified = next(text for text, value in RECTIFIED.items() if value is self.rectified)
+        return {"topics": topics, "depth_scale": self.depth_scale, "rectified": rectified}
 
     @property
     def given(self) -> bool:

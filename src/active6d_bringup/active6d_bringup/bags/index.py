@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.mcap_file import McapFile, RecordedMessage
 from active6d_bringup.bags.recorded_camera import import_camera
-from active6d_bringup.bags.source import BagError, damaged
+from active6d_bringup.bags.source import BagError, damaged, refuse_unfinished
 from active6d_bringup.bags.writer import ACTIVE6D, CHECKSUM, INFORMATION, SETTINGS, TYPESTORE, file_number, stamp_of
 from active6d_core.calibration import Calibration
 from active6d_core.ros.conversions import COLOR_ENCODINGS
@@ -36,7 +36,7 @@ class BagIndex:
     """The messages of a bag's topics of the contract.
 
     Attributes:
-        folder: of the bag.
+        folder: of the bag, or its file where that was named.
         payloads: topic of the contract to stamp (ns) to serialized message, the last one of a stamp.
         received: the same to the time (ns) at which it was recorded.
         diagnostics: every serialized message of ``/diagnostics``, in order.
@@ -96,7 +96,7 @@ def read_bag(path: Path, options: CameraOptions = CameraOptions()) -> BagIndex:
     """
     index: BagIndex | None = None
     damage: tuple[str, ...] = ()
-    if not options.given and ((path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))):
+    if not options.given and _may_be_of_the_contract(path):
         index, damage = _read_own(path)
     if index is not None:
         return index
@@ -108,18 +108,28 @@ def read_bag(path: Path, options: CameraOptions = CameraOptions()) -> BagIndex:
     return BagIndex(path, *made, [], {}, damage, camera.left_out, camera.notes, str(camera.topics))
 
 
-def _read_own(folder: Path) -> tuple[BagIndex | None, tuple[str, ...]]:
+def _may_be_of_the_contract(path: Path) -> bool:
+    """Whether a recording may hold the graph's topics as they are; of lone files only those of this project do."""
+    if path.is_file():
+        return path.suffix == ".mcap" and McapFile(path).begins_with(ACTIVE6D)
+    return (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
+
+
+def _read_own(path: Path) -> tuple[BagIndex | None, tuple[str, ...]]:
     """The bag's topics of the contract, None where its camera is not what the graph publishes; and the damage."""
-    metadata, damage = _read_metadata(folder)
+    # metadata.yaml describes all files of a bag: a lone file is whole without it.
+    metadata, damage = _read_metadata(path) if path.is_dir() else ({}, [])
     if metadata.get("storage_identifier", "mcap") == "mcap" and not metadata.get("compression_mode"):
-        messages, recorded, settings, lines = _read_mcap(folder, metadata)
+        messages, recorded, settings, lines = _read_mcap(path, metadata)
         damage += lines
     else:
-        messages, settings = _read_with_rosbags(folder), None
+        messages, settings = _read_with_rosbags(path), None
         recorded = {(message.topic, message.type) for message in messages}
+    # Only files of this project have a record that holds them.
+    own = settings is not None
     if settings is None:
         settings = (metadata.get("custom_data") or {}).get(SETTINGS)
-    names = topic_names(recorded, folder)
+    names = topic_names(recorded, path)
     if names is None:
         return None, tuple(damage)
     payloads: dict[str, dict[int, bytes]] = defaultdict(dict)
@@ -140,8 +150,9 @@ def _read_own(folder: Path) -> tuple[BagIndex | None, tuple[str, ...]]:
         payloads[topic][stamp] = message.payload
         received[topic][stamp] = message.received
     recording = dict(payloads), dict(received), diagnostics, _parse_settings(settings)
-    index = BagIndex(folder, *recording, tuple(damage), _incomplete(payloads))
-    usable = bool(damage) or (not repeated and _is_of_the_contract(index))
+    index = BagIndex(path, *recording, tuple(damage), _incomplete(payloads))
+    # Of a damaged bag of this project, what is whole is read. Another camera's messages must be those of the contract.
+    usable = (own and bool(damage)) or (not repeated and _is_of_the_contract(index))
     return index if usable else None, tuple(damage)
 
 
@@ -201,24 +212,28 @@ def _read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _read_mcap(
-    folder: Path, metadata: dict[str, Any]
+    path: Path, metadata: dict[str, Any]
 ) -> tuple[list[RecordedMessage], set[tuple[str, str]], str | None, list[str]]:
-    """The messages of a bag's MCAP files that may be of an episode, all topics, the settings if any, and the damage."""
+    """The messages of MCAP files that may be of an episode, all topics, the settings if any, and the damage.
+
+    The files are those of a folder, or the one that ``path`` names.
+    """
     names = metadata.get("relative_file_paths")
-    there = sorted(folder.glob("*.mcap"), key=file_number)
-    wanted = {Path(str(name)).name for name in names} if isinstance(names, list) else {path.name for path in there}
-    damage = [f"{name} is missing" for name in sorted(wanted - {path.name for path in there})]
+    files = sorted(path.glob("*.mcap"), key=file_number) if path.is_dir() else [path]
+    there = {each.name for each in files}
+    wanted = {Path(str(name)).name for name in names} if isinstance(names, list) else there
+    damage = [f"{name} is missing" for name in sorted(wanted - there)]
     messages: list[RecordedMessage] = []
     recorded: set[tuple[str, str]] = set()
     settings, checksum = None, None
-    for path in there:
-        file = McapFile(path)
+    for each in files:
+        file = McapFile(each)
         messages += [message for message in file.messages() if message.topic.endswith(_ENDINGS)]
         recorded |= file.topics
         damage += file.damage
         own = file.metadata.get(ACTIVE6D, {})
         settings, checksum = own.get(SETTINGS, settings), own.get(CHECKSUM)
-    text = (folder / "metadata.yaml").read_bytes() if metadata else b""
+    text = (path / "metadata.yaml").read_bytes() if metadata else b""
     if metadata and checksum is not None and f"{zlib.crc32(text):08x}" != checksum:
         damage.append("metadata.yaml differs from its checksum")
     return messages, recorded, settings, damage
@@ -226,6 +241,7 @@ def _read_mcap(
 
 def _read_with_rosbags(folder: Path) -> list[RecordedMessage]:
     """The messages of a bag in another storage than plain MCAP, in order of time."""
+    refuse_unfinished(folder)
     try:
         with Reader(folder) as reader:
             return [

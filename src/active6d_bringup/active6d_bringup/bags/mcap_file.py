@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import zstandard
-from mcap.records import Channel, Chunk, DataEnd, Footer, McapRecord, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 #: Bytes of a chunk without compression; a chunk holds one message or some of them, and an image is the largest.
@@ -57,6 +57,19 @@ class McapFile:
         return {
             (each.topic, self._schemas[each.schema_id].name) for each in channels if each.schema_id in self._schemas
         }
+
+    def definition(self, message_type: str) -> tuple[str, str]:
+        """Encoding and text of a type's definition, of the types read so far; empty where the file has none."""
+        found = next((each for each in self._schemas.values() if each.name == message_type), None)
+        return ("", "") if found is None else (found.encoding, found.data.decode(errors="replace"))
+
+    def begins_with(self, name: str) -> bool:
+        """Whether a metadata record of this name comes first in the file, before any message."""
+        with self.path.open("rb") as file:
+            for record in self._records(file, self.path.stat().st_size):
+                if not isinstance(record, Header):
+                    return isinstance(record, Metadata) and record.name == name
+        return False
 
     def messages(self) -> Iterator[RecordedMessage]:
         """The messages of all whole chunks, in order of the file.

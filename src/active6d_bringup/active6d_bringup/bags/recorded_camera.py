@@ -1,5 +1,6 @@
 """The views of a recording that another program made, as the camera's topics of the graph."""
 
+from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,7 +14,16 @@ import numpy as np
 from active6d_bringup.bags.camera_topics import INFO, TRANSFORMS, CameraOptions, CameraTopics, find_camera, with_options
 from active6d_bringup.bags.source import BagError, BagSource, open_source
 from active6d_bringup.bags.writer import TYPESTORE
-from active6d_bringup.camera.stream import SECOND, ArrivalGate, GateLimits, PoseHistory, Verdict, pose_difference
+from active6d_bringup.camera.rectification import are_rectified
+from active6d_bringup.camera.stream import (
+    SECOND,
+    ArrivalGate,
+    GateLimits,
+    PoseHistory,
+    Verdict,
+    nearest_position,
+    pose_difference,
+)
 from active6d_bringup.camera.view_maker import ViewMaker
 from active6d_core.camera import View
 from active6d_core.ros.conversions import MessageError, pose_to_transform
@@ -55,7 +65,7 @@ class _Scan:
     """Stamps of images, and all small messages."""
 
     color: list[tuple[int, int]]  # stamp used, position among the topic's messages
-    depth: list[tuple[int, int]]
+    depth: list[tuple[int, int]]  # in order of stamps
     arrival: list[int]  # of colour
     infos: list[tuple[int, Any]]
     depth_infos: list[tuple[int, Any]]
@@ -90,7 +100,7 @@ def import_camera(path: Path, options: CameraOptions = CameraOptions()) -> Recor
             world = "world" if scan.tree.has("world") else scan.tree.root(scan.color_frame)
             topics = replace(topics, world=world)
         chosen = list(_choose_views(scan, topics, left_out))
-        maker = ViewMaker(options.depth_scale, options.rectified)
+        maker = ViewMaker(options.depth_scale, are_rectified(options.rectified, topics.color))
         payloads: dict[str, dict[int, bytes]] = defaultdict(dict)
         received: dict[str, dict[int, int]] = defaultdict(dict)
         notes = ["header stamps are missing or go back: times of recording are used"] if scan.by_arrival else []
@@ -143,7 +153,7 @@ def _scan(source: BagSource, topics: CameraTopics) -> _Scan:
     color, depth = ([(entry[which], index) for index, entry in enumerate(each)] for each in stamps.values())
     return _Scan(
         color,
-        depth,
+        sorted(depth),
         [arrival for _, arrival in stamps[topics.color]],
         infos[topics.info],
         infos[topics.depth_info] if topics.depth_info else [],
@@ -164,10 +174,11 @@ def _choose_views(scan: _Scan, topics: CameraTopics, left_out: Counter[str]) -> 
     """Pairs of images with a camera pose; of a stream, one for each place where the camera stood."""
     tolerance = _ARRIVAL_TOLERANCE if scan.by_arrival else _TOLERANCE
     found, late = [], _Late()
+    depth_stamps = [stamp for stamp, _ in scan.depth]
     for stamp, position in scan.color:
-        nearest = min(scan.depth, key=lambda entry: abs(entry[0] - stamp), default=None)
-        if nearest is None or abs(nearest[0] - stamp) > tolerance:
-            late.add("depth image", tolerance, None if nearest is None else abs(nearest[0] - stamp))
+        nearest = nearest_position(depth_stamps, stamp)
+        if nearest is None or abs(depth_stamps[nearest] - stamp) > tolerance:
+            late.add("depth image", tolerance, None if nearest is None else abs(depth_stamps[nearest] - stamp))
             continue
         if topics.pose is not None:
             pose = scan.poses.nearest(stamp)
@@ -179,7 +190,7 @@ def _choose_views(scan: _Scan, topics: CameraTopics, left_out: Counter[str]) -> 
         except MessageError as error:
             left_out[str(error)] += 1
             continue
-        found.append(_Chosen(stamp, position, nearest[1], T))
+        found.append(_Chosen(stamp, position, scan.depth[nearest][1], T))
     left_out.update(late.reasons(len(scan.color)))
     gaps = np.diff([view.stamp for view in found])
     if len(gaps) and np.median(gaps) < _STREAM_NS:
@@ -288,9 +299,9 @@ def _make(topics: CameraTopics, scan: _Scan, view: _Chosen, color: Any, depth: A
 
 
 def _latest(messages: list[tuple[int, Any]], arrival: int) -> Any:
-    """The last message that had come by then, or the first one."""
-    earlier = [message for at, message in messages if at <= arrival]
-    return earlier[-1] if earlier else messages[0][1]
+    """The last message, of messages in order of arrival, that had come by then, or the first one."""
+    later = bisect_right(messages, arrival, key=itemgetter(0))
+    return messages[max(later - 1, 0)][1]
 
 
 def _messages(view: View) -> dict[str, bytes]:

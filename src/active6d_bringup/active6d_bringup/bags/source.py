@@ -17,6 +17,8 @@ _PACKED = (".mcap.zstd", ".db3.zstd")
 #: How Zstandard's frames begin, and no message of ROS 2 does.
 _ZSTANDARD = b"\x28\xb5\x2f\xfd"
 _LARGEST_MESSAGE = 2**28
+#: What SQLite has written and not yet put into its file is in a file with this at the end of its name.
+LOG = "-wal"
 
 
 class BagError(ValueError):
@@ -40,6 +42,10 @@ class BagSource:
     def typestore(self) -> Typestore:
         """The definitions of its messages."""
         return self._reader.typestore
+
+    def knows(self, message_type: str) -> bool:
+        """Whether messages of a type can be decoded: it is defined in the recording, or standard in one without any."""
+        return message_type in self.typestore.types
 
     def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
         """Connection, time of recording (ns) and serialized message, in order of recording."""
@@ -70,6 +76,7 @@ def open_source(path: Path) -> Iterator[BagSource]:
         BagError: there is none, or it is damaged; also for what fails while it is read.
     """
     files = find_files(path)
+    refuse_unfinished(path)
     try:
         with AnyReader(files, default_typestore=TYPESTORE) as reader:
             yield BagSource(path, files, reader)
@@ -78,6 +85,18 @@ def open_source(path: Path) -> Iterator[BagSource]:
     # A damaged file fails anywhere in its decoding, with the error of whichever library was at work.
     except Exception as error:
         raise damaged(path, error) from error
+
+
+def refuse_unfinished(path: Path) -> None:
+    """Refuse sqlite3 files whose last messages are in a write-ahead log, which the reader would leave out.
+
+    Raises:
+        BagError: there is such a log; the text names it.
+    """
+    files = sorted(path.glob("*.db3")) if path.is_dir() else [path]
+    logs = [log for log in (file.with_name(file.name + LOG) for file in files) if log.is_file() and log.stat().st_size]
+    if logs:
+        raise damaged(path, BagError(f"messages are in {logs[0].name} and not in the bag yet"))
 
 
 def damaged(path: Path, error: Exception) -> BagError:

@@ -7,6 +7,9 @@ from typing import Any
 
 from active6d_bringup.bags.source import open_source
 
+#: Of messages that cannot be decoded.
+_NOT_DEFINED = "definition not in the bag"
+
 
 @dataclass(frozen=True)
 class TopicSummary:
@@ -18,7 +21,7 @@ class TopicSummary:
         count: number of its messages.
         rate_hz: mean rate by the times of recording, None with fewer than two messages.
         frame: frame of the first message, empty without any.
-        content: size and encoding of the first image, empty for other messages.
+        content: size and encoding of the first image, or that the type is not defined; empty for other messages.
     """
 
     name: str
@@ -65,7 +68,8 @@ def summarise(path: Path) -> BagSummary:
             key = connection.topic, connection.msgtype
             times[key].append(arrival)
             if key not in first:
-                first[key] = _describe(source.deserialize(payload, connection.msgtype))
+                known = source.knows(connection.msgtype)
+                first[key] = _describe(source.deserialize(payload, connection.msgtype)) if known else ("", _NOT_DEFINED)
     topics = []
     for key in keys:
         at = times[key]

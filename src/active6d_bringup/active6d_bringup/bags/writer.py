@@ -200,49 +200,12 @@ class EpisodeWriter:
         self._stream.close()
 
     def _describe(self) -> dict[str, Any]:
-        """What metadata.yaml says, in version 9 of rosbag2's format (Jazzy)."""
-        files = [file for file in self._files if sum(file["counts"].values())] or self._files
-        start, end = min(file["first"] for file in files), max(file["last"] for file in files)
-
-        def span(first: int, last: int) -> dict[str, Any]:
-            return {
-                "duration": {"nanoseconds": max(last - first, 0)},
-                "starting_time": {"nanoseconds_since_epoch": first},
-            }
-
         counts = {topic.name: sum(file["counts"][topic.name] for file in self._files) for topic in CONTRACT}
-        return {
-            "version": 9,
-            "storage_identifier": "mcap",
-            "relative_file_paths": [file["path"] for file in self._files],
-            **span(start, end),
-            "message_count": self.message_count,
-            "topics_with_message_count": [
-                {
-                    "topic_metadata": {
-                        "name": self._names[topic.name],
-                        "type": topic.type,
-                        "serialization_format": "cdr",
-                        "offered_qos_profiles": [_offered(topic)],
-                        "type_description_hash": TYPESTORE.hash_rihs01(topic.type),
-                    },
-                    "message_count": counts[topic.name],
-                }
-                for topic in CONTRACT
-            ],
-            "compression_format": "",
-            "compression_mode": "",
-            "files": [
-                {
-                    "path": file["path"],
-                    **span(file["first"], file["last"]),
-                    "message_count": sum(file["counts"].values()),
-                }
-                for file in self._files
-            ],
-            "custom_data": {SETTINGS: self._settings},
-            "ros_distro": "jazzy",
-        }
+        topics = [
+            describe_topic(self._names[topic.name], topic.type, [_offered(topic)], counts[topic.name])
+            for topic in CONTRACT
+        ]
+        return describe_bag(self._files, topics, {SETTINGS: self._settings})
 
 
 def _was_killed(folder: Path) -> bool:
@@ -294,6 +257,59 @@ def stamp_of(message_type: str, payload: bytes) -> int:
         offset = 8
     seconds = int.from_bytes(payload[offset : offset + 4], order, signed=True)
     return seconds * 1_000_000_000 + int.from_bytes(payload[offset + 4 : offset + 8], order)
+
+
+def describe_topic(name: str, message_type: str, qos: list[dict[str, Any]], count: int) -> dict[str, Any]:
+    """What metadata.yaml says of a topic; the hash of a type that is not standard is left empty, which is allowed."""
+    return {
+        "topic_metadata": {
+            "name": name,
+            "type": message_type,
+            "serialization_format": "cdr",
+            "offered_qos_profiles": qos,
+            "type_description_hash": TYPESTORE.hash_rihs01(message_type) if message_type in TYPESTORE.types else "",
+        },
+        "message_count": count,
+    }
+
+
+def describe_bag(files: list[dict[str, Any]], topics: list[dict[str, Any]], custom: dict[str, str]) -> dict[str, Any]:
+    """What metadata.yaml says, in version 9 of rosbag2's format (Jazzy).
+
+    Args:
+        files: of each the path, the number of messages by topic (counts), and their first and last time (ns).
+        topics: as ``describe_topic`` makes them.
+        custom: further keys and values.
+    """
+    counted = [file for file in files if sum(file["counts"].values())] or files
+    start, end = min(file["first"] for file in counted), max(file["last"] for file in counted)
+
+    def span(first: int, last: int) -> dict[str, Any]:
+        return {
+            "duration": {"nanoseconds": max(last - first, 0)},
+            "starting_time": {"nanoseconds_since_epoch": first},
+        }
+
+    return {
+        "version": 9,
+        "storage_identifier": "mcap",
+        "relative_file_paths": [file["path"] for file in files],
+        **span(start, end),
+        "message_count": sum(topic["message_count"] for topic in topics),
+        "topics_with_message_count": topics,
+        "compression_format": "",
+        "compression_mode": "",
+        "files": [
+            {
+                "path": file["path"],
+                **span(file["first"], file["last"]),
+                "message_count": sum(file["counts"].values()),
+            }
+            for file in files
+        ],
+        "custom_data": custom,
+        "ros_distro": "jazzy",
+    }
 
 
 def _offered(topic: Topic) -> dict[str, Any]:

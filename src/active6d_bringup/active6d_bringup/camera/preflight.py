@@ -10,6 +10,8 @@ _SCALE_FACTOR = 3.0
 _FARTHEST_CAMERA = 20.0
 #: Cosine of the angle between the camera's axis and the way to the bin, below which it looks past the bin.
 _TOWARDS_BIN = 0.5
+#: Nanoseconds by which no driver's poses come after its images.
+_LATEST_POSE = 10**9
 
 
 def check_depth_unit(depth: np.ndarray, distance: float | None = None) -> str:
@@ -86,6 +88,23 @@ def check_pose_stamp(nearest: int | None, stamp: int, tolerance: int) -> str:
         return f"the nearest camera pose is {difference * 1e-9:.1f} s from the image: do both use the same clock?"
     return (
         f"the nearest camera pose is {difference * 1e-6:.0f} ms from the image: set pose_tolerance or publish it faster"
+    )
+
+
+def check_pose_lag(lag: int, tolerance: int, full: bool) -> str:
+    """Whether images wait for camera poses in vain; empty if not.
+
+    Args:
+        lag: from the newest pose to the newest image that waits for one, ns.
+        tolerance: what is accepted, ns.
+        full: whether so many images wait that the oldest ones are dropped.
+    """
+    # Between two poses every image waits for a moment.
+    if lag <= tolerance or not (full or lag > _LATEST_POSE):
+        return ""
+    return (
+        f"the newest camera pose is {lag * 1e-9:.1f} s older than the newest image: their clocks differ, or poses come "
+        "late or no more; let both use the same clock, and publish poses sooner"
     )
 
 

@@ -1,5 +1,7 @@
 """Rectification of colour and of depth registered to it, through OpenCV."""
 
+import re
+
 import cv2
 import numpy as np
 
@@ -8,6 +10,16 @@ from active6d_core.camera import PinholeCamera, pixel_rays
 
 #: ROS distortion model to the numbers of coefficients that it may have.
 _MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+
+#: Values of the nodes' parameter ``rectified``; None is for what the name of the topic says.
+RECTIFIED: dict[str, bool | None] = {"auto": None, "yes": True, "no": False}
+#: A word of a topic's name, such as image_rect_color/compressed or rect/image, and not corrected or direct.
+_WORD = re.compile(r"(^|[/_])rect(ified)?($|[/_])")
+
+
+def are_rectified(setting: bool | None, topic: str) -> bool:
+    """Whether images are rectified already: what the user says, else what the name of their topic says."""
+    return bool(_WORD.search(topic)) if setting is None else setting
 
 
 class Rectifier:

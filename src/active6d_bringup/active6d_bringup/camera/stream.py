@@ -1,7 +1,8 @@
 """One view for every goal out of a free-running stream: frames matched, camera arrived, still, and fresh."""
 
+from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any
@@ -54,6 +55,13 @@ class FrameMatcher:
         self._on_pair(color[0], color[1], depth[1])
 
 
+def nearest_position(stamps: Sequence[int], stamp: int) -> int | None:
+    """Position of the stamp nearest to another, of stamps in order; None where there is none."""
+    after = bisect_left(stamps, stamp)
+    around = range(max(after - 1, 0), min(after + 1, len(stamps)))
+    return min(around, key=lambda position: abs(stamps[position] - stamp), default=None)
+
+
 class PoseHistory:
     """The camera's poses of the last seconds.
 
@@ -62,13 +70,20 @@ class PoseHistory:
     """
 
     def __init__(self, keep: int | None = _KEPT_POSES) -> None:
-        self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=keep)
+        self._keep = keep
+        # Two lists in order of stamps: a recording has many poses, and all its images look for theirs.
+        self._stamps: list[int] = []
+        self._poses: list[np.ndarray] = []
 
     def add(self, stamp: int, T_world_camera: np.ndarray) -> None:
         """Take (4, 4) ``T_world_camera`` at a stamp (ns); a clock that goes back begins a new history."""
-        if self._poses and stamp < self._poses[-1][0]:
+        if self._stamps and stamp < self._stamps[-1]:
+            self._stamps.clear()
             self._poses.clear()
-        self._poses.append((stamp, T_world_camera))
+        self._stamps.append(stamp)
+        self._poses.append(T_world_camera)
+        if self._keep is not None and len(self._stamps) > self._keep:
+            del self._stamps[0], self._poses[0]
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -76,20 +91,21 @@ class PoseHistory:
     @property
     def newest(self) -> int | None:
         """Stamp (ns) of the last pose."""
-        return self._poses[-1][0] if self._poses else None
+        return self._stamps[-1] if self._stamps else None
 
     @property
     def last(self) -> np.ndarray | None:
         """(4, 4) the last pose."""
-        return self._poses[-1][1] if self._poses else None
+        return self._poses[-1] if self._poses else None
 
     def nearest(self, stamp: int) -> tuple[int, np.ndarray] | None:
         """Stamp (ns) and pose nearest to a stamp."""
-        return min(self._poses, key=lambda entry: abs(entry[0] - stamp), default=None)
+        position = nearest_position(self._stamps, stamp)
+        return None if position is None else (self._stamps[position], self._poses[position])
 
     def between(self, start: int, end: int) -> list[np.ndarray]:
         """Poses at stamps (ns) in [start, end]."""
-        return [T for stamp, T in self._poses if start <= stamp <= end]
+        return self._poses[bisect_left(self._stamps, start) : bisect_right(self._stamps, end)]
 
 
 @dataclass(frozen=True)

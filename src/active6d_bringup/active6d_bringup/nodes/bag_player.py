@@ -11,6 +11,7 @@ from sensor_msgs.msg import PointCloud2
 from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.index import read_bag
 from active6d_bringup.bags.source import BagError
+from active6d_bringup.camera.rectification import RECTIFIED
 from active6d_core.ros import topics
 from active6d_core.ros.clock_output import ClockOutput
 from active6d_core.ros.conversions import stamp_to_ns
@@ -38,7 +39,12 @@ class BagPlayerNode(GraphNode):
         )
         self.declare("topics", "", "topics of a foreign recording, such as color=/left/image,depth=/left/depth")
         self.declare("depth_scale", 0.0, "metres per unit of its depth, 0: as REP-118 says", minimum=0.0)
-        self.declare("rectified", False, "its images are rectified, whatever camera_info says")
+        self.declare(
+            "rectified",
+            "auto",
+            "whether its images are rectified already; auto: if rect is a word of the colour topic's name",
+            choices=tuple(RECTIFIED),
+        )
         self._clock_output = ClockOutput(self)
         self._outputs = {}
         for topic in topics.REPLAYED_TOPICS:
@@ -58,7 +64,8 @@ class BagPlayerNode(GraphNode):
         folder, self._rate = self.value("bag"), self.value("rate")
         if not folder:
             raise ValueError("bag_player: parameter 'bag' must name the folder of a bag")
-        options = CameraOptions.parse(self.value("topics"), self.value("depth_scale"), self.value("rectified"))
+        rectified = RECTIFIED[self.value("rectified")]
+        options = CameraOptions.parse(self.value("topics"), self.value("depth_scale"), rectified)
         self._views, self._received = _read_views(Path(folder).expanduser(), options)
         self._stamps = sorted(self._views)
         self._next = 0

@@ -8,7 +8,8 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 
-from active6d_bringup.camera.preflight import check_pose_rate, check_pose_stamp, check_skew
+from active6d_bringup.camera.preflight import check_pose_lag, check_pose_rate, check_pose_stamp, check_skew
+from active6d_bringup.camera.rectification import RECTIFIED, are_rectified
 from active6d_bringup.camera.stream import SECOND, ArrivalGate, FrameMatcher, GateLimits, PoseHistory, Verdict
 from active6d_bringup.camera.view_maker import ViewMaker
 from active6d_bringup.nodes.driver_inputs import DriverInputs
@@ -76,8 +77,8 @@ class CameraAdapterNode(GraphNode):
         self.declare(
             "rectified",
             "auto",
-            "whether images are rectified already; auto: if color_topic has 'rect' in its name",
-            choices=("auto", "yes", "no"),
+            "whether images are rectified already; auto: if rect is a word of color_topic",
+            choices=tuple(RECTIFIED),
         )
         self.declare("stamp_tolerance", 0.02, "seconds by which stamps of colour and depth may differ", minimum=0.0)
         self.declare("pose_tolerance", 0.05, "seconds by which the nearest pose may differ from the image", minimum=0.0)
@@ -98,9 +99,8 @@ class CameraAdapterNode(GraphNode):
 
     def setup(self) -> None:
         """Read the parameters."""
-        name, rectified = self.value("color_topic"), self.value("rectified")
-        is_rectified = "rect" in name.rsplit("/", 2)[-1] if rectified == "auto" else rectified == "yes"
-        self._maker = ViewMaker(self.value("depth_scale"), is_rectified)
+        rectified = are_rectified(RECTIFIED[self.value("rectified")], self.value("color_topic"))
+        self._maker = ViewMaker(self.value("depth_scale"), rectified)
         self._T_pose_camera = self.rigid_transform("hand_eye")
         extrinsics = self.value("depth_to_color")
         self._T_color_depth = None if extrinsics == _NOT_SET else self.rigid_transform("depth_to_color")
@@ -256,6 +256,9 @@ class CameraAdapterNode(GraphNode):
             window = round(self._limits.still_seconds * SECOND)
             recent = self._poses.between(self._poses.newest - window, self._poses.newest)
             self.say_once(check_pose_rate(len(recent), self._limits.still_seconds))
+            if self._pending:
+                lag = self._pending[-1][0] - self._poses.newest
+                self.say_once(check_pose_lag(lag, self._pose_tolerance, len(self._pending) == _PENDING))
 
     def _why_no_pose(self) -> str:
         topic = self.value("pose_topic")

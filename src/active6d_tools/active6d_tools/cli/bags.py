@@ -41,7 +41,7 @@ def check(
     folder: BagFolder,
     topics: BagTopics = "",
     depth_scale: BagDepthScale = 0.0,
-    rectified: BagRectified = False,
+    rectified: BagRectified = None,
     json_file: JsonFile = None,
 ) -> None:
     """Read every view of a bag as replay would, and say what is left out and why. Exit with code 1 if anything is.

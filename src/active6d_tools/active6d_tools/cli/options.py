@@ -29,7 +29,11 @@ BagDepthScale = Annotated[
     float, typer.Option("--depth-scale", min=0.0, help="Metres per unit of its depth; by default as REP-118 says.")
 ]
 BagRectified = Annotated[
-    bool, typer.Option("--rectified", help="Its images are rectified, whatever camera_info says of distortion.")
+    bool | None,
+    typer.Option(
+        "--rectified/--raw",
+        help="Whether its images are rectified already; by default if rect is a word of the colour topic's name.",
+    ),
 ]
 BagObject = Annotated[str | None, typer.Option("--object", help="Name of the object, if the bag does not contain it.")]
 Processes = Annotated[bool, typer.Option("--processes", help="Run every node in its own process.")]

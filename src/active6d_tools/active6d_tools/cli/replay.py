@@ -36,7 +36,7 @@ def replay(
     object_name: BagObject = None,
     topics: BagTopics = "",
     depth_scale: BagDepthScale = 0.0,
-    rectified: BagRectified = False,
+    rectified: BagRectified = None,
     estimator: Annotated[
         str | None, typer.Option(help="Estimator to use instead of the recorded one: auto, {estimators}.")
     ] = None,

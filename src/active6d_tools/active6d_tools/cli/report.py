@@ -27,7 +27,7 @@ def report(
     object_name: BagObject = None,
     topics: BagTopics = "",
     depth_scale: BagDepthScale = 0.0,
-    rectified: BagRectified = False,
+    rectified: BagRectified = None,
     episode: Annotated[int, typer.Option(min=0, help="Number of the episode in a bag with several, from 0.")] = 0,
     json_file: JsonFile = None,
 ) -> None:
