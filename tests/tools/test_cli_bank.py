@@ -103,10 +103,10 @@ def test_scenes_that_a_bank_loses_are_named(monkeypatch, tmp_path):
     monkeypatch.setattr(bank_module, "build_bank", build)
     result = run("bank", "--object", "mug", "--split", "val", "--scenes", "1", "--banks", str(tmp_path))
     assert result.exit_code == 0, result.stderr
-    told = " ".join(result.stderr.split())
-    assert f"{bank_path(tmp_path, 'mug', 'val')} was made with another estimator" in told
-    assert "dropped: mug/val/1, mug/val/2. " in told
-    assert "also keeps" not in told
+    told = "".join(result.stderr.split())  # lines are broken anywhere in a path
+    assert f"{bank_path(tmp_path, 'mug', 'val')}wasmadewithanotherestimator" in told
+    assert "dropped:mug/val/1,mug/val/2." in told
+    assert "alsokeeps" not in told
 
 
 def test_no_heap_is_in_two_splits():

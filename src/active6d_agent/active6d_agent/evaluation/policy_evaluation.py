@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm, t
 
 from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.rollout import EpisodeResults, measure, roll_out
@@ -116,8 +117,9 @@ class Intervals:
 
     ``ci95`` draws episodes: the range over other starts in the same scenes. ``ci95_scenes`` draws whole scenes with all
     their starts (a cluster bootstrap): the range over other scenes. The starts of a scene share one heap, so they are
-    not independent. A claim about unseen scenes needs the second, wider interval. With ten scenes it is still about a
-    tenth too narrow.
+    not independent. A claim about unseen scenes needs the second, wider interval. A bootstrap of few scenes is too
+    narrow: it is widened as Student's distribution and the factor for the sample's variance say (Hesterberg, "What
+    teachers should know about the bootstrap", 2015), by 22 % with ten scenes, and stays within the values.
 
     To compare two policies from the same starts, give the differences, which pairs the episodes.
 
@@ -129,16 +131,26 @@ class Intervals:
 
     def __init__(self, scene: np.ndarray, seed: int = 0, resamples: int = _RESAMPLES) -> None:
         clusters = {"ci95": np.arange(len(scene)), "ci95_scenes": np.unique(scene, return_inverse=True)[1]}
-        self._weights = {}
+        self._weights: dict[str, np.ndarray] = {}
+        self._factor = dict.fromkeys(clusters, 1.0)
         for kind, cluster in clusters.items():
             count = cluster.max() + 1
             rng = np.random.default_rng(seed)
             weight = rng.multinomial(count, np.full(count, 1.0 / count), size=resamples)[:, cluster]
             self._weights[kind] = weight / weight.sum(axis=1, keepdims=True)
+            if kind == "ci95_scenes" and count > 1:
+                narrow = norm.ppf(0.975) * np.sqrt((count - 1) / count)
+                self._factor[kind] = float(t.ppf(0.975, count - 1) / narrow)
 
     def of(self, values: np.ndarray) -> dict[str, list[float]]:
         """Both intervals of the mean of (E,) values, by name."""
-        return {kind: np.quantile(weight @ values, [0.025, 0.975]).tolist() for kind, weight in self._weights.items()}
+        return {
+            kind: self._interval(kind, weight @ values, values.mean(), values) for kind, weight in self._weights.items()
+        }
+
+    def _interval(self, kind: str, resampled: np.ndarray, centre: float, values: np.ndarray) -> list[float]:
+        ends = np.quantile(resampled, [0.025, 0.975])
+        return np.clip(centre + self._factor[kind] * (ends - centre), values.min(), values.max()).tolist()
 
     def of_ratio(self, part: np.ndarray, whole: np.ndarray) -> dict[str, list[float]]:
         """Both intervals of the mean of (E,) ``part`` over that of (E,) ``whole``.
@@ -149,7 +161,8 @@ class Intervals:
         for kind, weight in self._weights.items():
             wholes = weight @ whole
             some = wholes > 0
-            table[kind] = np.quantile((weight @ part)[some] / wholes[some], [0.025, 0.975]).tolist()
+            ratios = part[whole > 0] / whole[whole > 0]
+            table[kind] = self._interval(kind, (weight @ part)[some] / wholes[some], part.mean() / whole.mean(), ratios)
         return table
 
 

@@ -195,7 +195,7 @@ def train_dagger(
     if resume:
         best, seconds = learner.restore(latest)
         begun -= seconds
-    starts = all_starts(validation, parameters.starts, parameters.seed)
+    starts = all_starts(validation, parameters.starts)  # the same for every seed, whose networks are compared
     common = {"parameters": asdict(parameters), "bank": train.bank.provenance}
     checkpoints = Checkpoints()
     while learner.round < parameters.rounds:
