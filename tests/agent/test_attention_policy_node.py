@@ -214,6 +214,16 @@ def answer(played, state, reason=""):
     played.graph.publish("view_goal/status", message, latched=True)
 
 
+def test_a_motion_node_may_refuse_with_the_usual_quality_of_service_and_no_frame(episode):
+    played = episode(policy="max-distance")
+    arm = played.graph.node.create_publisher(DiagnosticArray, "view_goal/status", 10)
+    played.start(SECOND)
+    played.view(40)
+    played.graph.spin_until(lambda: len(played.goals) == 1 and arm.get_subscription_count())
+    arm.publish(GoalStatus(played.stamp, "", GoalState.REFUSED, "in the wall").to_message())
+    played.graph.spin_until(lambda: len(played.goals) == 2)
+
+
 def test_three_refused_goals_give_way_to_other_views(episode):
     played = episode(policy="max-distance")
     played.start(SECOND)

@@ -324,6 +324,21 @@ def test_images_that_come_before_the_transforms_do_not_keep_later_ones_away(grap
     np.testing.assert_allclose(pose_to_transform(cell.pose[0].pose), POSES[0], atol=1e-9)
 
 
+def test_a_slow_camera_stands_still_by_the_transforms_between_its_images(graph, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    monkeypatch.setattr(transform_input, "import_optional", lambda name: SimpleNamespace(TFMessage=None))
+    cell = Cell(graph, Traits(rate_hz=2.0), parameters={"pose_topic": ""})
+    listener = cell.adapter._transforms._source
+    for _ in range(6):
+        for stamp in range(cell.driver.stamp, cell.driver.stamp + SECOND // 2 + 1, SECOND // 100):
+            stamped = TransformStamped(
+                header=make_header(stamp, "world"), child_frame_id=FRAME, transform=transform_of(POSES[0])
+            )
+            listener.take(SimpleNamespace(transforms=[stamped]), static=False)
+        cell.driver.run(1)
+    graph.spin_until(lambda: all(cell.boxes))
+
+
 def transform_of(T):
     pose, transform = transform_to_pose(T), Transform()
     transform.rotation = pose.orientation

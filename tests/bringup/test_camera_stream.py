@@ -45,10 +45,25 @@ def rational(x, y, d):
 
 
 MODELS = {
+    # Drivers fill up with zeros, and give a lens of eight coefficients the name of five.
+    "": (rational, [-0.12, 0.05, 0.002, -0.001, 0.01]),
+    "brown_conrady": (rational, [0.3, -0.2, 0.001, 0.001, 0.05, 0.35, -0.15, 0.02]),
     "plumb_bob": (rational, [-0.12, 0.05, 0.002, -0.001, 0.01]),
     "rational_polynomial": (rational, [0.3, -0.2, 0.001, 0.001, 0.05, 0.35, -0.15, 0.02]),
     "equidistant": (fisheye, [-0.02, 0.01, -0.005, 0.001]),
 }
+
+
+@pytest.mark.parametrize(
+    ("name", "of", "filled"),
+    [("plumb_bob", "rational_polynomial", 0), ("plumb_bob", "plumb_bob", 3), ("equidistant", "equidistant", 4)],
+)
+def test_coefficients_of_a_longer_model_and_zeros_at_the_end_are_taken(name, of, filled):
+    d = np.array(MODELS[of][1])
+    longer = Rectifier(Calibration(160, 120, CAMERA.matrix, np.append(d, np.zeros(filled)), model=name))
+    image = np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8)
+    expected = Rectifier(Calibration(160, 120, CAMERA.matrix, d, model=of)).color(image)
+    np.testing.assert_array_equal(longer.color(image), expected)
 
 
 def distorted_image(model, R=np.eye(3)):
@@ -297,9 +312,16 @@ def test_a_live_history_keeps_the_last_poses_and_begins_again_when_the_clock_goe
     history = PoseHistory(keep=3)
     for stamp in range(5):
         history.add(stamp, np.full((4, 4), stamp))
-    assert (len(history), history.newest, history.nearest(0)[0]) == (3, 4, 2)
-    history.add(1, np.eye(4))
-    assert (len(history), history.newest) == (1, 1)
+    assert (len(history), history.oldest, history.newest, history.nearest(0)[0]) == (4, 1, 4, 1)
+    history.add(0, np.eye(4))
+    assert (len(history), history.newest) == (1, 0)
+
+
+def test_fast_poses_are_kept_as_long_as_slow_ones():
+    history = PoseHistory()
+    for stamp in range(0, 5 * SECOND, SECOND // 1000):
+        history.add(stamp, np.eye(4))
+    assert history.nearest(2 * SECOND)[0] == 2 * SECOND
 
 
 class Arm:
@@ -337,6 +359,22 @@ def test_the_first_view_comes_when_the_camera_stands():
     ((index, verdict, _),) = decided(arm.stand(2.0))
     assert verdict is Verdict.TAKE
     assert 8 <= index <= 10  # 0.3 s at 30 Hz
+
+
+def test_one_image_on_request_is_enough_where_poses_come_meanwhile():
+    """Such a camera takes no image before it stands."""
+    arm, goal = Arm(), SPHERE.pose(SPHERE.positions[40])
+
+    def settle(T):
+        for _ in range(60):
+            arm.stamp += SECOND // 50
+            arm.poses.add(arm.stamp, T)
+        return arm.gate.judge(arm.stamp)[0]
+
+    assert settle(arm.T) is Verdict.TAKE
+    arm.gate.ask(goal)
+    assert arm.gate.judge(arm.stamp)[0] is Verdict.WAIT  # of before the goal
+    assert settle(goal) is Verdict.TAKE
 
 
 def test_a_goal_is_answered_once_after_arrival_and_not_on_the_way():

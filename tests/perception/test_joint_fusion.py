@@ -15,7 +15,7 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.ambiguity import ambiguity_of
 from active6d_perception.scene import body_candidates, body_refinement, joint_fusion
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer
-from active6d_perception.scene.expected_visibility import OPEN_TABLE
+from active6d_perception.scene.expected_visibility import OPEN_TABLE, Tray
 from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.measured_cases import CASES, FITTING, LOOKED_THROUGH, WHAT, WHOSE
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
@@ -111,6 +111,17 @@ def test_an_object_of_another_size_is_judged_like_one_of_usual_size(mug, episode
     assert e_add(mug, resized(found.T_world_object, 1 / scale)[:, None], TRUE).min(axis=0).max() < 1e-3
     np.testing.assert_allclose(found.probability, expected.probability, atol=0.02)
     np.testing.assert_allclose(found.entropy, expected.entropy, atol=0.1)
+
+
+def test_what_stands_in_a_wall_is_withdrawn_where_the_walls_are_known(mug, episode):
+    for width, walled, found in ((0.12, False, 2), (0.12, True, 0), (0.5, True, 2)):
+        # The mugs lie at x = -8 and 8 cm.
+        fusion = JointFusion(mug, weights=hand_set_weights(), tray=Tray(width, 1.0, 0.2), walled=walled)
+        for view in episode:
+            fusion.add_view(*view)
+        objects = objects_of(fusion, episode[-1])
+        assert (objects.probability > 0.5).sum() == found
+        assert fusion.in_walls == (2 if width < 0.2 and walled else 0)
 
 
 def resized(T, scale):

@@ -8,8 +8,16 @@ import numpy as np
 from active6d_core.calibration import Calibration
 from active6d_core.camera import PinholeCamera, pixel_rays
 
-#: ROS distortion model to the numbers of coefficients that it may have.
-_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+#: ROS distortion model to the numbers of coefficients that it may have. Drivers call every model of Brown and Conrady
+#: plumb_bob, with as many coefficients as OpenCV takes in the same order; some fill up with zeros.
+_BROWN_CONRADY = (4, 5, 8, 12, 14)
+_MODELS = {
+    "plumb_bob": _BROWN_CONRADY,
+    "rational_polynomial": _BROWN_CONRADY,
+    "brown_conrady": _BROWN_CONRADY,
+    "": _BROWN_CONRADY,
+    "equidistant": (4,),
+}
 
 #: Values of the nodes' parameter ``rectified``; None is for what the name of the topic says.
 RECTIFIED: dict[str, bool | None] = {"auto": None, "yes": True, "no": False}
@@ -46,7 +54,7 @@ class Rectifier:
             raise ValueError("camera_info has distortion but no K; calibrate the camera")
         distort = _undistort_function(calibration)
         raw, size = calibration.in_image(calibration.K), calibration.image_size
-        maps = distort(raw, calibration.D, calibration.R, self.camera.matrix, size, cv2.CV_32FC1)
+        maps = distort(raw, _coefficients(calibration), calibration.R, self.camera.matrix, size, cv2.CV_32FC1)
         self._maps = (maps[0], maps[1])
         if not np.allclose(calibration.R, np.eye(3), atol=1e-6):
             # Depth lies along the raw camera's axis; R maps its rays to those of the rectified camera.
@@ -70,8 +78,15 @@ class Rectifier:
 def _undistort_function(calibration: Calibration):  # type: ignore[no-untyped-def]  # OpenCV has no types
     sizes = _MODELS.get(calibration.model)
     if sizes is None:
-        raise ValueError(f"distortion model '{calibration.model}' is not one of {', '.join(_MODELS)}")
-    if len(calibration.D) not in sizes:
+        known = ", ".join(filter(None, _MODELS))
+        raise ValueError(f"distortion model '{calibration.model}' is not one of {known}")
+    if len(_coefficients(calibration)) not in sizes:
         expected = " or ".join(map(str, sizes))
         raise ValueError(f"{calibration.model} has {expected} coefficients, camera_info has {len(calibration.D)}")
     return cv2.fisheye.initUndistortRectifyMap if calibration.model == "equidistant" else cv2.initUndistortRectifyMap
+
+
+def _coefficients(calibration: Calibration) -> np.ndarray:
+    """The distortion, of a fisheye lens without the zeros with which a driver fills it up."""
+    fisheye = calibration.model == "equidistant" and not calibration.D[4:].any()
+    return calibration.D[:4] if fisheye else calibration.D

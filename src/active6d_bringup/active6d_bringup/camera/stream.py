@@ -12,9 +12,9 @@ import numpy as np
 from active6d_core.se3 import rotation_angle
 
 SECOND = 1_000_000_000
-#: Images and poses kept: more than any driver's streams are apart.
+#: Images and nanoseconds of poses kept: more than any driver's streams are apart.
 _KEPT_FRAMES = 8
-_KEPT_POSES = 500
+_KEPT_POSES = 10 * SECOND
 
 
 class FrameMatcher:
@@ -66,7 +66,7 @@ class PoseHistory:
     """The camera's poses of the last seconds.
 
     Args:
-        keep: how many, None for all.
+        keep: nanoseconds before the newest one, None for all.
     """
 
     def __init__(self, keep: int | None = _KEPT_POSES) -> None:
@@ -82,11 +82,17 @@ class PoseHistory:
             self._poses.clear()
         self._stamps.append(stamp)
         self._poses.append(T_world_camera)
-        if self._keep is not None and len(self._stamps) > self._keep:
-            del self._stamps[0], self._poses[0]
+        if self._keep is not None:
+            old = bisect_left(self._stamps, stamp - self._keep)
+            del self._stamps[:old], self._poses[:old]
 
     def __len__(self) -> int:
         return len(self._poses)
+
+    @property
+    def oldest(self) -> int | None:
+        """Stamp (ns) of the first pose that is kept."""
+        return self._stamps[0] if self._stamps else None
 
     @property
     def newest(self) -> int | None:
@@ -160,26 +166,26 @@ class ArrivalGate:
 
     def ask(self, T_world_goal: np.ndarray | None) -> None:
         """Wait for a goal's view; None for a view from wherever the camera stands."""
-        self._goal, self._since, self._stands_since = T_world_goal, None, None
+        # Poses come also between the images of a camera that takes one on request.
+        self._goal, self._since, self._stands_since = T_world_goal, self._poses.newest, None
         self._asked_from, self._moved, self.waiting = self._poses.last, False, True
 
     def judge(self, stamp: int) -> tuple[Verdict, str]:
         """What the image at a stamp (ns) is for, with the reason of a refusal; a verdict but WAIT ends the waiting."""
         if not self.waiting:
             return Verdict.WAIT, ""
-        if self._since is None or stamp < self._since:
-            self._since = stamp
         limits, window = self._limits, round(self._limits.still_seconds * SECOND)
         found = self._poses.nearest(stamp)
         if found is None:
             return Verdict.WAIT, ""
+        self._since = since = self._waiting_since(stamp)
         T_now = found[1]
         if self._asked_from is None:
             self._asked_from = T_now
         recent = self._poses.between(stamp - window, stamp)
         # An image of before the goal is none of its view, even if the camera need not move.
         # A single pose says nothing of movement.
-        still = stamp - self._since >= window and len(recent) > 1 and all(self._same_place(T, T_now) for T in recent)
+        still = stamp - since >= window and len(recent) > 1 and all(self._same_place(T, T_now) for T in recent)
         self._moved |= not self._same_place(self._asked_from, T_now)
         metres, degrees = (0.0, 0.0) if self._goal is None else pose_difference(T_now, self._goal)
         if still and metres <= limits.arrival_metres and degrees <= limits.arrival_degrees:
@@ -194,11 +200,20 @@ class ArrivalGate:
         if self._goal is not None and self._moved and stands:
             self.waiting = False
             return Verdict.REFUSE, f"the camera stopped {where}"
-        if self._goal is not None and 0 < limits.goal_seconds * SECOND <= stamp - self._since:
+        if self._goal is not None and 0 < limits.goal_seconds * SECOND <= stamp - since:
             self.waiting = False
             state = "is still on its way" if self._moved else "has not moved"
             return Verdict.REFUSE, f"the camera {state} after {limits.goal_seconds:g} s, {where}"
         return Verdict.WAIT, ""
+
+    def _waiting_since(self, stamp: int) -> int:
+        """Stamp (ns) since which a view is awaited: of the goal or the first pose, or now if the clock went back."""
+        oldest, newest = self._poses.oldest, self._poses.newest
+        if oldest is None or newest is None:
+            return stamp
+        if self._since is None:
+            return oldest
+        return stamp if newest < self._since else self._since
 
     def _same_place(self, T_a: np.ndarray, T_b: np.ndarray) -> bool:
         metres, degrees = pose_difference(T_a, T_b)

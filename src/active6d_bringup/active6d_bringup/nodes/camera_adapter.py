@@ -118,6 +118,7 @@ class CameraAdapterNode(GraphNode):
         self._goal_stamp: int | None = None
         self._goal: PoseStamped | None = None
         self._begins, self._last_stamp, self._unmatched, self._color_frame = True, -1, 0, ""
+        self._asked_until = -1
 
     def awaited(self) -> Awaited:
         """The stream while a view is due, else the next goal."""
@@ -147,8 +148,19 @@ class CameraAdapterNode(GraphNode):
             self._asks_extrinsics = False
             self._transforms.request(0, self._on_extrinsics, depth.header.frame_id, self._color_frame)
         if self._transforms is not None and not self.value("pose_topic"):
-            self._transforms.request(stamp, partial(self._add_pose, stamp), self._color_frame)
+            self._request_poses(stamp)
         self._advance()
+
+    def _request_poses(self, stamp: int) -> None:
+        """Ask /tf for the poses at an image and before it: those at the images of a slow camera show no standing."""
+        assert self._transforms is not None
+        window = round(self._limits.still_seconds * SECOND)
+        if stamp < self._asked_until:
+            self._asked_until = -1  # the clock went back
+        for at in (stamp - window, stamp - window // 2, stamp):
+            if at > self._asked_until:
+                self._asked_until = at
+                self._transforms.request(at, partial(self._add_pose, at), self._color_frame)
 
     def _on_extrinsics(self, T_color_depth: np.ndarray) -> None:
         self._T_color_depth = T_color_depth

@@ -124,7 +124,8 @@ class GoalStatus:
         Raises:
             MessageError: another frame, or no known state.
         """
-        if frame is not None and message.header.frame_id != frame:
+        # A status has no place: a motion node need not name the frame.
+        if frame is not None and message.header.frame_id not in ("", frame):
             raise MessageError(f"frame_id is '{message.header.frame_id}', expected '{frame}'")
         values = _values(message)
         state = values.get("state", "")

@@ -58,8 +58,8 @@ class Topic:
 
     @property
     def from_camera(self) -> bool:
-        """Whether a camera driver publishes it; its subscribers take the quality of service that the driver offers."""
-        return self.name.startswith("camera/")
+        """Whether a driver or the camera's motion publishes it, with a quality of service that subscribers adapt to."""
+        return self.name.startswith(("camera/", "view_goal/status"))
 
 
 _POSE = "geometry_msgs/msg/PoseStamped"

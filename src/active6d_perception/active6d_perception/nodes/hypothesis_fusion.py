@@ -128,7 +128,12 @@ class HypothesisFusionNode(GraphNode):
         )
 
     def _declare_bin(self) -> None:
-        self.declare("bin_width", 0.0, "bin between its walls, world x, metres; 0: that of the usual bin", minimum=0.0)
+        self.declare(
+            "bin_width",
+            0.0,
+            "bin between its walls, world x, metres; objects in its walls are withdrawn; 0: not known",
+            minimum=0.0,
+        )
         self.declare("bin_depth", 0.0, "bin between its walls, world y, metres; 0: as bin_width", minimum=0.0)
         self.declare(
             "wall_height",
@@ -178,7 +183,8 @@ class HypothesisFusionNode(GraphNode):
         usual, height = Tray.for_model(self._model), self.value("wall_height")
         width = self.value("bin_width") or usual.width
         tray = Tray(width, self.value("bin_depth") or width, usual.wall_height if height < 0 else height)
-        return JointFusion(self._model, parameters, tray=tray, align=self.value("align_views"))
+        walled = self.value("bin_width") > 0
+        return JointFusion(self._model, parameters, tray=tray, walled=walled, align=self.value("align_views"))
 
     def _make_grid(self) -> SurfaceGrid:
         usual = SurfaceGrid.for_model(self._model)
@@ -236,6 +242,11 @@ class HypothesisFusionNode(GraphNode):
             summary.append(f"{len(hypotheses)} hypotheses, {len(objects)} objects, {confirmed} of them confirmed")
             if aligned.shift:
                 summary.append(f"the camera's pose was corrected by {1e3 * aligned.shift:.1f} mm at the scene")
+            if isinstance(self._fusion, JointFusion) and self._fusion.in_walls:
+                self.say_once(
+                    f"{self._fusion.in_walls} objects stand in the bin's walls and are withdrawn; if they are right, "
+                    "correct bin_width, bin_depth, wall_height or the world's origin"
+                )
             if not aligned.aligned:
                 summary.append("the depth image could not be aligned with the others, the camera's pose is as given")
 

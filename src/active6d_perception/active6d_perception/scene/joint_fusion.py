@@ -46,6 +46,8 @@ BESIDE = 1.3
 # Refinement, metres: gates of the steps, and the lattice. Bodies are many and only compared; what is reported is finer.
 _BODY_GATES, _BODY_LATTICE = (0.008, 0.004, 0.004), 0.002
 WHOLE_GATES, _WHOLE_LATTICE = (0.008, 0.004), 0.0005
+#: A body with more of its surface than this beyond a wall stands in it.
+_IN_WALL = 0.25
 #: A body whose log-odds are this far below those of the best at its place is dropped.
 HOPELESS = 12.0
 # Evidence is taken at poses on this lattice, metres.
@@ -90,6 +92,7 @@ class JointFusion:
         parameters: settings shared with :class:`.SceneFusion`.
         weights: of the belief; those of the object when None.
         tray: floor and walls; those of the object's usual bin when None.
+        walled: whether the walls are really there; objects that stand in them are withdrawn.
         align: whether poses of cameras are corrected, see :mod:`.camera_alignment`.
     """
 
@@ -100,10 +103,13 @@ class JointFusion:
         weights: BeliefWeights | None = None,
         tray: Tray | None = None,
         *,
+        walled: bool = False,
         align: bool = True,
     ) -> None:
         self.parameters = parameters or FusionParameters()
-        self._align, self.cameras = align, CameraAlignment()
+        self._align, self.cameras, self._walled = align, CameraAlignment(), walled
+        #: How many objects were last withdrawn because they stand in a wall.
+        self.in_walls = 0
         self.ambiguity: Ambiguity = ambiguity_of(model)
         self.weights = weights or load_belief(belief_path(model.name))
         self._tray = tray or Tray.for_model(model)
@@ -309,6 +315,10 @@ class JointFusion:
         apart, members = self._members(T, hypotheses)
         description = describe_objects(evidence, beliefs, members, table[:, 1], stamps)
         probability = expit(self.weights.probability(description))
+        if self._walled:
+            impossible = evidence.bodies.container[beliefs.candidate, 2] > _IN_WALL
+            self.in_walls = int((impossible & (probability >= self.parameters.confirmed)).sum())
+            probability = np.where(impossible, 0.0, probability)
         first = np.argsort(-probability, kind="stable")
         first = first[probability[first] >= self.parameters.least_probability]
         apart_enough = self.parameters.exclusion * ambiguity.diameter
