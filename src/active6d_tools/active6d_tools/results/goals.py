@@ -38,8 +38,8 @@ def goals_table(
             except KeyError:
                 cells.append("not measured")
                 continue
-            answer = word if verdict.met else f"**not {word}**"
-            cells.append(f"{answer}{verdict.caveat and ' ' + verdict.caveat}: {verdict.figures}")
+            answer = f"{word} {verdict.caveat}".strip() if verdict.met else f"**not {word}**"
+            cells.append(f"{answer}: {verdict.figures}")
         rows.append(cells)
     return table(["", *measured], rows)
 
