@@ -189,7 +189,7 @@ def test_goals_are_met_or_not(evaluated):
         "thirty scenes decide"
     )
     assert told["Its learned attention beats the lowest score (the paper: +3 % found, -9 % ADD)"][0] == (
-        f"met: +.020 found, ADD {-200 / lowest['e_add_mm'].mean():+.0f} %"
+        f"met with one training of each: +.020 found, ADD {-200 / lowest['e_add_mm'].mean():+.0f} %"
     )
 
 
