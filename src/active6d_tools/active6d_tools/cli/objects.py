@@ -122,7 +122,9 @@ def add(
     elif known is not None:
         description["symmetry"] = known.description
     description |= {"instances": list(instances), "color": list(color), "source": mesh.name}
-    model = _store(mesh, mesh_path, description_path, yaml.safe_dump(description, sort_keys=False))
+    text = yaml.safe_dump(description, sort_keys=False)
+    # Makers of data sets choose symmetries by rules of their own.
+    model = _store(mesh, mesh_path, description_path, text, check_axis=axis is not None)
     loaded = load_mesh(mesh)
     notes += [f"repaired each time it is loaded: {repair}" for repair in close_mesh(loaded)]
     if (edges := open_edges(loaded)) > 0:
@@ -151,15 +153,19 @@ def _symmetry_notes(known: "ModelSymmetry", model: "ObjectModel", scale: float) 
     return notes
 
 
-def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str) -> "ObjectModel":
+def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str, check_axis: bool) -> "ObjectModel":
     """Copy the mesh, write the description and read the object; nothing is left where that fails."""
     from active6d_core.object_model import read_description
+    from active6d_tools.axis_check import refuse_wrong_axis
 
     mesh_path.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(mesh, mesh_path)
     try:
         write_file(description_path, description)
-        return read_description(description_path)
+        model = read_description(description_path)
+        if check_axis:
+            refuse_wrong_axis(model)
+        return model
     except Exception as error:  # readers of meshes raise many kinds on damaged files
         description_path.unlink(missing_ok=True)
         mesh_path.unlink()
