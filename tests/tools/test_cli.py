@@ -209,6 +209,19 @@ def add_bolt(tmp_path):
     return lambda *arguments: run(*command, *arguments)
 
 
+def test_the_offset_to_the_mesh_file_is_said(tmp_path, monkeypatch):
+    mesh = trimesh.creation.box((30.0, 40.0, 120.0))
+    mesh.apply_translation((100.0, -20.0, 60.0))
+    mesh.export(tmp_path / "plate.stl")
+    into = str(tmp_path / "objects")
+    added = run("object", "add", str(tmp_path / "plate.stl"), "--name", "plate", "--scale", "0.001", "--into", into)
+    assert "origin_mm 100.00 -20.00 60.00:" in " ".join(added.stdout.split())
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", into)
+    shown = run("object", "show", "plate", "--json", str(tmp_path / "plate.json"))
+    assert "origin mm" in shown.stdout
+    assert json.loads((tmp_path / "plate.json").read_text())["origin_mm"] == pytest.approx([100.0, -20.0, 60.0])
+
+
 def test_an_axis_that_the_mesh_does_not_have_is_refused(tmp_path, add_bolt):
     refused = add_bolt("--axis", "0", "0", "1")
     words = " ".join(refused.stderr.split())
