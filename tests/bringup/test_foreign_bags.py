@@ -190,17 +190,45 @@ def test_compressed_images_in_sqlite3_are_the_same_views(tmp_path):
     )  # JPEG halves the resolution of colour
 
 
-def test_poses_come_from_transforms_of_a_moving_flange(tmp_path):
-    T_flange_camera = make_transform(np.eye(3), np.array([0.02, 0.0, 0.07]))
-    messages = [entry for entry in driver_messages() if entry[1] != POSE]
-    message = TYPES["tf2_msgs/msg/TFMessage"]
-    messages.append((1, "/tf_static", message([transform(T_flange_camera, 0, "flange", FRAME)])))
+T_FLANGE_CAMERA = make_transform(np.eye(3), np.array([0.02, 0.0, 0.07]))
+
+
+def with_transforms(messages, pose_topic=None, flange=True):
+    """The messages with the camera on a flange in /tf, or on nothing; and the driver's poses on a topic, or nowhere.
+
+    With another topic than the camera's, these poses are the flange's.
+    """
+    kind = TYPES["tf2_msgs/msg/TFMessage"]
+    found = [entry for entry in messages if entry[1] != POSE]
+    found.append((1, "/tf_static", kind([transform(T_FLANGE_CAMERA, 0, "flange", FRAME)])))
     for number, view in enumerate(VIEWS):
         stamp = (100 + number) * SECOND + 1_000_000
-        T_base_flange = view.T_world_camera @ np.linalg.inv(T_flange_camera)
-        messages.append((stamp, "/tf", message([transform(T_base_flange, stamp, "base", "flange")])))
-    index = assert_views(write(tmp_path / "bag", sorted(messages, key=lambda entry: entry[0])))
-    assert "from /tf" in index.source
+        T_base_flange = view.T_world_camera @ np.linalg.inv(T_FLANGE_CAMERA)
+        if flange:
+            found.append((stamp, "/tf", kind([transform(T_base_flange, stamp, "base", "flange")])))
+        if pose_topic is not None:
+            T = T_base_flange if flange and "camera" not in pose_topic else view.T_world_camera
+            found.append((stamp, pose_topic, pose(T, stamp)))
+    return sorted(found, key=lambda entry: entry[0])
+
+
+def test_poses_come_from_transforms_of_a_moving_flange(tmp_path):
+    index = assert_views(write(tmp_path / "bag", with_transforms(driver_messages())))
+    assert index.source.endswith("world=base (from /tf)")
+
+
+def test_transforms_are_preferred_to_the_poses_of_a_tool(tmp_path):
+    tool = "/tcp_pose_broadcaster/pose"
+    bag = write(tmp_path / "bag", with_transforms(driver_messages(), tool))
+    index = assert_views(bag)
+    assert f"world=base (from /tf rather than {tool}; --topics pose=NAME" in index.source
+    assert read_bag(bag, CameraOptions.parse(f"pose={tool}")).source.endswith(f"pose={tool}")
+
+
+@pytest.mark.parametrize(("topic", "flange"), [("/my_camera/pose", True), ("/robot/tool_pose", False)])
+def test_poses_of_a_camera_and_those_without_a_moving_flange_are_taken(tmp_path, topic, flange):
+    bag = write(tmp_path / "bag", with_transforms(driver_messages(), topic, flange))
+    assert assert_views(bag).source.endswith(f"pose={topic}")
 
 
 @pytest.mark.parametrize("stamps", ["zero", "restarted"])

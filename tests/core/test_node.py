@@ -370,6 +370,42 @@ def test_exit_code_two_is_for_parameters_and_a_defect_shows_its_traceback(argume
     assert ("Traceback" in ended.stderr) == (code == 1)
 
 
+HOLDS = "the file must hold NODE: {ros__parameters: {NAME: VALUE}}"
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "advice"),
+    [
+        (
+            "n:\n  ros__parameters:\n    hand_eye: [0.03, 0, 0.06, 0, 0, 0, 1]\n",
+            ", line 3: the values of a list differ in type; ",
+            "write 0.0 in place of 0",
+        ),
+        ("n:\n  gain: 1.0\n", ", line 2: ", HOLDS),
+        ("n:\n  hand_eye: [1.0]\n", ", line 2: ", HOLDS),
+        ("n:\n  ros__parameters:\n    - [\n", ", line 3: ", "correct it, or leave it out"),
+        (None, " does not exist or cannot be read; ", "name another one after --params-file"),
+    ],
+)
+def test_a_broken_parameter_file_is_one_line(tmp_path, text, words, advice):
+    path = tmp_path / "my cell.yaml"
+    if text is not None:
+        path.write_text(text)
+    ended = run_a_node("file", "--ros-args", "--params-file", str(path))
+    assert ended.returncode == 2
+    assert ended.stderr.startswith(f"error: params file {path}{words}")
+    assert advice in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+
+
+def test_a_list_of_mixed_numbers_on_the_command_line_is_one_line():
+    ended = run_a_node("list", "--ros-args", "-p", "hand_eye:=[0.1, 0]")
+    assert (ended.returncode, len(ended.stderr.splitlines())) == (2, 1)
+    assert ended.stderr.startswith(
+        "error: parameter hand_eye:=[0.1, 0]: the values of a list differ in type; write 0.0"
+    )
+
+
 def test_a_node_that_the_system_refuses_is_one_line():
     ended = run_a_node("refused")
     reason = "pthread_create failed: Resource temporarily unavailable"

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
+import yaml
 from ament_index_python.packages import PackageNotFoundError
 
 from active6d_core.ros.graph_nodes import BAD_PARAMETERS, NODES
@@ -32,7 +33,7 @@ def test_every_argument_has_a_description():
     descriptions = {name: entry.elts[2].value for name, entry in items("ARGUMENTS")}
     wanted = (
         "object policy seed scene steps metres estimator camera record bag rviz namespace params_file"
-        " autostart use_sim_time play rate network"
+        " autostart use_sim_time play rate network defaults_file"
     )
     assert set(descriptions) == set(wanted.split())
     assert all(len(description) > 10 for description in descriptions.values())
@@ -123,6 +124,20 @@ def test_the_nodes_that_a_camera_needs_are_started(names, given, started):
     assert names["_wanted"]({**defaults, **given}) == {"pose_estimator", "hypothesis_fusion"} | started
 
 
+def test_a_parameter_file_is_overridden_by_what_is_given_alone(names):
+    """In ROS the last value of a parameter counts, so the order is defaults, the user's file, arguments."""
+    made = sys.modules["launch_ros.actions"].Node
+    defaults = {name: default for name, (default, _, _) in names["ARGUMENTS"].items()}
+    for executable, own in {"attention_policy": [], "episode_recorder": [{"resume": True}]}.items():
+        names["_node"](executable, {**defaults, "params_file": "mine.yaml"})
+        assert made.call_args.kwargs["parameters"] == ["mine.yaml", *own]
+    given = {"params_file": "mine.yaml", "defaults_file": "cell.yaml", "autostart": "false", "steps": "3"}
+    names["_node"]("attention_policy", {**defaults, **given})
+    *files, parameters = made.call_args.kwargs["parameters"]
+    assert files == ["cell.yaml", "mine.yaml"]
+    assert parameters.keys() == {"autostart", "steps"}
+
+
 @pytest.mark.parametrize(("code", "ends"), [(BAD_PARAMETERS, True), (0, False), (1, False), (-9, False)])
 def test_a_node_that_refuses_its_parameters_ends_the_launch(names, code, ends):
     event = SimpleNamespace(returncode=code, process_name="pose_estimator-1")
@@ -144,9 +159,12 @@ def test_a_cell_is_the_graph_with_the_adapter_and_a_recorder(monkeypatch):
     given = dict(included.call_args.kwargs["launch_arguments"])
     graph = {name for name, _ in items("ARGUMENTS")}
     assert (given["camera"], given["record"]) == ("adapter", "true")
-    assert given.keys() == cell["ARGUMENTS"].keys() | {"camera", "record"}
+    assert given.keys() == cell["ARGUMENTS"].keys() | {"camera", "record", "defaults_file"}
     assert given.keys() <= graph
     assert cell["ARGUMENTS"]["network"][0] == "false"
+    assert {cell["ARGUMENTS"][name][0] for name in ("policy", "estimator", "steps", "metres")} == {""}
+    defaults = yaml.safe_load(Path(given["defaults_file"]).read_text())
+    assert defaults == {"/**/pose_estimator": {"ros__parameters": {"estimator": "geometric"}}}
     needed = {name for name, (default, _) in cell["ARGUMENTS"].items() if default is None}
     assert needed == {"object", "params_file", "bag"}
     assert all(len(description) > 10 for _, description in cell["ARGUMENTS"].values())

@@ -42,7 +42,7 @@ def test_an_axis_with_an_offset_becomes_the_axis_of_the_object(tmp_path):
     added = add(mesh, tmp_path / "objects")
     assert added.exit_code == 0, added.output
     assert "symmetry taken from models_info.json" in added.output
-    assert "centroid" not in added.output
+    assert "move the centroid" not in added.output
     np.testing.assert_allclose(read_description(tmp_path / "objects" / "part.yaml").symmetry.axis, [0, 0, 1])
 
 
@@ -56,7 +56,7 @@ def test_rounded_discrete_symmetries_make_the_whole_group(tmp_path):
     mesh = model(tmp_path, {"symmetries_discrete": [about(R, SHIFT) for R in group]}, box)
     added = add(mesh, tmp_path / "objects")
     assert added.exit_code == 0, added.output
-    assert "centroid" not in added.output
+    assert "move the centroid" not in added.output
     assert len(read_description(tmp_path / "objects" / "part.yaml").symmetry.discrete) == 8
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -193,6 +194,58 @@ def test_an_added_object_is_found_and_measured(tmp_path, monkeypatch):
     again = run("object", "add", str(mesh), "--name", "brick", "--into", str(tmp_path / "objects"))
     assert again.exit_code == 2
     assert "exists already" in again.stderr
+
+
+@pytest.fixture
+def add_bolt(tmp_path):
+    """Adds a bolt along x with a hexagonal head, 35 mm long, by the arguments given."""
+    head, shaft = trimesh.creation.cylinder(7.5, 5.0, sections=6), trimesh.creation.cylinder(4.0, 30.0)
+    shaft.apply_translation((0.0, 0.0, 17.5))
+    bolt = trimesh.util.concatenate([head, shaft])
+    bolt.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (0.0, 1.0, 0.0)))
+    bolt.export(tmp_path / "bolt.stl")
+    into = tmp_path / "objects"
+    command = ["object", "add", str(tmp_path / "bolt.stl"), "--name", "bolt", "--scale", "0.001", "--into", str(into)]
+    return lambda *arguments: run(*command, *arguments)
+
+
+def test_the_offset_to_the_mesh_file_is_said(tmp_path, monkeypatch):
+    mesh = trimesh.creation.box((30.0, 40.0, 120.0))
+    mesh.apply_translation((100.0, -20.0, 60.0))
+    mesh.export(tmp_path / "plate.stl")
+    into = str(tmp_path / "objects")
+    added = run("object", "add", str(tmp_path / "plate.stl"), "--name", "plate", "--scale", "0.001", "--into", into)
+    assert "origin_mm 100.00 -20.00 60.00:" in " ".join(added.stdout.split())
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", into)
+    shown = run("object", "show", "plate", "--json", str(tmp_path / "plate.json"))
+    assert "origin mm" in shown.stdout
+    assert json.loads((tmp_path / "plate.json").read_text())["origin_mm"] == pytest.approx([100.0, -20.0, 60.0])
+
+
+def test_an_axis_that_the_mesh_does_not_have_is_refused(tmp_path, add_bolt):
+    refused = add_bolt("--axis", "0", "0", "1")
+    words = " ".join(refused.stderr.split())
+    assert refused.exit_code == 2
+    assert "bolt.stl cannot be added: --axis is no axis of symmetry" in words
+    # The end of the shaft is 15 mm or more from everything when it stands across.
+    deviation = float(re.search(r"moves by up to ([\d.]+) mm", words)[1])
+    assert 12.0 < deviation < 35.0
+    assert words.endswith("--axis can be x (1 0 0)")
+    assert not [path for path in (tmp_path / "objects").rglob("*") if path.is_file()]
+
+
+def test_the_axis_that_the_mesh_has_is_taken(add_bolt):
+    assert add_bolt("--axis", "-2", "0", "0").exit_code == 0
+
+
+def test_a_mesh_without_an_axis_names_none(tmp_path):
+    trimesh.creation.box((0.03, 0.03, 0.04)).export(tmp_path / "box.stl")
+    into = str(tmp_path / "objects")
+    refused = run("object", "add", str(tmp_path / "box.stl"), "--name", "box", "--axis", "0", "0", "1", "--into", into)
+    # A corner is 21.2 mm from the axis, a side 15 mm.
+    words = " ".join(refused.stderr.split())
+    assert "moves by up to 6.2 mm" in words
+    assert "none of x, y and z is one" in words
 
 
 def test_a_mesh_that_stays_open_is_said_to_be(tmp_path):

@@ -21,6 +21,7 @@ SHARE = Path(get_package_share_directory("active6d_bringup"))
 # name: (default, choices, description). An empty default leaves the choice to the parameter file.
 ARGUMENTS = {
     "params_file": (str(SHARE / "config" / "active6d.yaml"), None, "parameters of all nodes"),
+    "defaults_file": ("", None, "parameters that those of params_file replace; empty: none"),
     "namespace": ("", None, "prefix of every node and topic"),
     "camera": (
         "simulator",
@@ -34,8 +35,16 @@ ARGUMENTS = {
     "policy": ("", None, "which policy chooses the views; empty: as in params_file"),
     "steps": ("", None, "moves in an episode; empty: as in params_file"),
     "metres": ("", None, "travel budget of an episode in metres, 0.0: none; empty: as in params_file"),
-    "autostart": ("true", ["true", "false"], "nodes configure and activate themselves; false: `ros2 lifecycle set`"),
-    "use_sim_time": ("false", ["true", "false"], "take the nodes' clock from /clock; stamps of views never do"),
+    "autostart": (
+        "",
+        ["", "true", "false"],
+        "nodes configure and activate themselves; false: `ros2 lifecycle set`; empty: as in params_file",
+    ),
+    "use_sim_time": (
+        "",
+        ["", "true", "false"],
+        "take the nodes' clock from /clock; stamps of views never do; empty: as in params_file",
+    ),
     "play": ("", None, "folder of the bag to play, with camera:=bag"),
     "rate": ("", None, "speed of playing against the recording; 0.0: as fast as perception; empty: as in params_file"),
     "record": ("false", ["true", "false"], "record every topic of the graph"),
@@ -69,6 +78,7 @@ def _node(executable: str, given: dict[str, str]) -> Node:
         for name in [*entry.launch_parameters, "autostart", "use_sim_time"]
         if given[arguments.get(name, name)]
     }
+    files = [given[name] for name in ("defaults_file", "params_file") if given[name]]
     if executable == "episode_recorder":
         parameters["resume"] = True
     return Node(
@@ -76,7 +86,8 @@ def _node(executable: str, given: dict[str, str]) -> Node:
         executable=executable,
         name=executable,
         namespace=given["namespace"],
-        parameters=[given["params_file"], parameters],
+        # The last one that has a parameter counts.
+        parameters=[*files, *([parameters] if parameters else [])],
         output="screen",
         respawn=entry.restarted,
         # Longer than the shutdown takes that _end_on_bad_parameters asks for.

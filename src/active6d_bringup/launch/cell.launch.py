@@ -12,6 +12,7 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
 SHARE = Path(get_package_share_directory("active6d_bringup"))
+DEFAULTS = str(SHARE / "config" / "cell.yaml")
 
 # name: (default, None where it must be given; description).
 ARGUMENTS = {
@@ -22,9 +23,15 @@ ARGUMENTS = {
         "the arm reaches (attention_policy: radius, reach_*)",
     ),
     "bag": (None, "folder to create for the recording; the first thing to look at when something went wrong"),
-    "policy": ("auto", "which policy chooses the views; auto: the best that the object has weights for"),
-    "estimator": ("geometric", "which pose estimator; geometric needs no training and uses depth alone"),
-    "steps": ("5", "moves in an episode: the arm stands at one view more"),
+    "policy": (
+        "",
+        "which policy chooses the views, auto: the best that the object has weights for; empty: as in params_file",
+    ),
+    "estimator": (
+        "",
+        "which pose estimator; empty: as in params_file, or geometric, which needs no training, where that has none",
+    ),
+    "steps": ("", "moves in an episode: the arm stands at one view more; empty: as in params_file"),
     "metres": ("", "travel budget of an episode in metres; empty: as in params_file"),
     "namespace": ("", "prefix of every node and topic, for several cells on one network"),
     "network": (
@@ -44,6 +51,6 @@ def generate_launch_description() -> LaunchDescription:
     given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     graph = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(SHARE / "launch" / "active6d.launch.py")),
-        launch_arguments={**given, "camera": "adapter", "record": "true"}.items(),
+        launch_arguments={**given, "defaults_file": DEFAULTS, "camera": "adapter", "record": "true"}.items(),
     )
     return LaunchDescription([*arguments, graph])

@@ -7,7 +7,9 @@ from typing import Any
 from active6d_bringup.bags.source import BagError, BagSource
 from active6d_bringup.camera.rectification import RECTIFIED
 from active6d_core.calibration import Calibration
+from active6d_core.ros.conversions import MessageError
 from active6d_core.ros.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_INFO, CAMERA_POSE
+from active6d_core.ros.transform_tree import TransformTree
 
 IMAGES = {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"}
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -87,6 +89,7 @@ class CameraTopics:
         pose: None where poses come from /tf.
         depth_info: None where depth is registered to colour.
         world: frame that counts as the world with /tf, None for "world" or the root of the tree.
+        passed_over: topics of poses that /tf is preferred to.
     """
 
     color: str
@@ -95,11 +98,17 @@ class CameraTopics:
     pose: str | None
     depth_info: str | None
     world: str | None
+    passed_over: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         parts = [f"color={self.color}", f"depth={self.depth}", f"info={self.info}"]
         parts += [f"depth_info={self.depth_info}"] if self.depth_info else []
-        return ",".join([*parts, f"pose={self.pose}" if self.pose else f"world={self.world or 'world'} (from /tf)"])
+        if self.pose:
+            return ",".join([*parts, f"pose={self.pose}"])
+        tf = "from /tf"
+        if self.passed_over:
+            tf += f" rather than {', '.join(self.passed_over)}; --topics pose=NAME if that is the camera's pose"
+        return ",".join([*parts, f"world={self.world or 'world'} ({tf})"])
 
 
 @dataclass(frozen=True)
@@ -142,18 +151,39 @@ def find_camera(source: BagSource, options: CameraOptions) -> CameraTopics:
     if not registered and depth_info is None:
         own = [each for each in infos if each.frame == depth.frame and each.topic != info.topic]
         depth_info = own[0].topic if len(own) == 1 else None
-    return CameraTopics(color.topic, depth.topic, info.topic, _pose(source, named), depth_info, named.get("world"))
+    pose, passed_over = _pose(source, named, color.frame)
+    return CameraTopics(color.topic, depth.topic, info.topic, pose, depth_info, named.get("world"), passed_over)
 
 
-def _pose(source: BagSource, named: dict[str, str]) -> str | None:
+def _pose(source: BagSource, named: dict[str, str], color_frame: str) -> tuple[str | None, tuple[str, ...]]:
+    """The topic of camera poses, None for /tf; and the topics that /tf is preferred to."""
     poses = sorted({each.topic for each in source.connections if each.msgtype in POSES and "goal" not in each.topic})
     transforms = any(each.msgtype == TRANSFORMS for each in source.connections)
     if "world" in named and "pose" not in named and transforms:
-        return None
+        return None, ()
     if not poses and transforms and "pose" not in named:
-        return None
+        return None, ()
+    if "pose" not in named and transforms and _tf_carries(source, color_frame):
+        # Drivers of arms publish the tool's pose, too, and nothing in the message tells it from the camera's.
+        of_camera = [topic for topic in poses if "camera" in topic.lower()]
+        if not of_camera:
+            return None, tuple(poses)
+        poses = of_camera
     candidates = [_Candidate(topic, "", None) for topic in poses]
-    return _choose(source, "pose", candidates, named, lambda each: each.topic.endswith(_NAMES["pose"])).topic
+    return _choose(source, "pose", candidates, named, lambda each: each.topic.endswith(_NAMES["pose"])).topic, ()
+
+
+def _tf_carries(source: BagSource, frame: str) -> bool:
+    """Whether /tf has the pose of a frame that moves. The driver's own static frames are not enough."""
+    tree = TransformTree()
+    for connection, _, payload in source.messages([each for each in source.connections if each.msgtype == TRANSFORMS]):
+        try:
+            tree.add(source.deserialize(payload, connection.msgtype), connection.topic.endswith("static"))
+        except MessageError:  # a topic with poses can do without
+            return False
+        if tree.moves(frame):
+            return True
+    return False
 
 
 def _choose(

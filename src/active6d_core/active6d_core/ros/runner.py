@@ -1,6 +1,7 @@
 """The main function of every node's executable."""
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -76,7 +77,10 @@ def _refuse(text: str) -> NoReturn:
 
 def _refuse_words(arguments: list[str]) -> None:
     """End with usage, or with an error: rclpy would drop silently what stands before ``--ros-args``."""
-    words = remove_ros_args(arguments)[1:]
+    try:
+        words = remove_ros_args(arguments)[1:]
+    except RuntimeError as error:
+        _refuse(_explain_arguments(error))
     if not words:
         return
     usage = f"usage: {Path(arguments[0]).stem} [--ros-args -p NAME:=VALUE ... --params-file FILE]"
@@ -84,3 +88,23 @@ def _refuse_words(arguments: list[str]) -> None:
         print(f"{usage}\nparameters and topics: docs/graph.md, or `ros2 param describe` while it runs")
         sys.exit(0)
     _refuse(f"'{words[0]}' is not for a node; parameters come after --ros-args\n{usage}")
+
+
+def _explain_arguments(error: RuntimeError) -> str:
+    """What is wrong with a parameter file or another argument, from the words of rcl, and what to do."""
+    found = re.search(r"'(?:--params-file|--param|-p) (?P<what>.*?)'\. Error: (?P<reason>.*)", str(error), re.DOTALL)
+    if found is None:
+        return " ".join(str(error).split())
+    where = f"params file {found['what']}" if "--params-file" in found[0] else f"parameter {found['what']}"
+    # The rest is where in rcl's own source it was noticed.
+    reason = " ".join(found["reason"].partition(", at /")[0].split())
+    if "opening YAML file" in reason:
+        return f"{where} does not exist or cannot be read; name another one after --params-file"
+    line = re.search(r"line(?:_num)? (\d+)", reason)
+    where += f", line {line[1]}" if line and "--params-file" in found[0] else ""
+    if "same type" in reason:
+        return f"{where}: the values of a list differ in type; write 0.0 in place of 0 where others are not whole"
+    # The latter is what rcl says of a list right below the node's name.
+    if "ros__parameters" in reason or "not keys" in reason:
+        return f"{where}: {reason}; the file must hold NODE: {{ros__parameters: {{NAME: VALUE}}}}"
+    return f"{where}: {reason}; correct it, or leave it out"

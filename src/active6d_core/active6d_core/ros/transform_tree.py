@@ -65,6 +65,10 @@ class TransformTree:
         """Whether a transform names the frame."""
         return frame in self._parents or frame in self._parents.values()
 
+    def moves(self, frame: str) -> bool:
+        """Whether a frame is carried by something that moves: a transform on its way to the root is not static."""
+        return any(child not in self._static for child in self._chain(frame)[:-1])
+
     def lookup(self, target: str, source: str, stamp: int, tolerance: int | None) -> np.ndarray:
         """(4, 4) ``T_target_source`` at a stamp (ns).
 

@@ -99,8 +99,6 @@ def add(
 
     Example: [bold]active6d object add bracket.stl --name bracket --scale 0.001 --into objects[/bold]
     """
-    import os
-
     import yaml
 
     from active6d_core.mesh_file import close_mesh, load_mesh, mesh_notes, open_edges
@@ -122,7 +120,9 @@ def add(
     elif known is not None:
         description["symmetry"] = known.description
     description |= {"instances": list(instances), "color": list(color), "source": mesh.name}
-    model = _store(mesh, mesh_path, description_path, yaml.safe_dump(description, sort_keys=False))
+    text = yaml.safe_dump(description, sort_keys=False)
+    # Makers of data sets choose symmetries by rules of their own.
+    model = _store(mesh, mesh_path, description_path, text, check_axis=axis is not None)
     loaded = load_mesh(mesh)
     notes += [f"repaired each time it is loaded: {repair}" for repair in close_mesh(loaded)]
     if (edges := open_edges(loaded)) > 0:
@@ -131,8 +131,20 @@ def add(
         )
     for note in notes + ([] if known is None else _symmetry_notes(known, model, scale)):
         console.print(note, highlight=False, markup=False)
+    _print_added(model, into)
+
+
+def _print_added(model: "ObjectModel", into: Path) -> None:
+    """What a user needs to go on with a new object: its measures, its frame and where it is found."""
+    import os
+
     size = " x ".join(f"{1e3 * extent:.1f}" for extent in model.mesh.extents)
-    console.print(f"added {name}: {1e3 * model.diameter:.1f} mm in diameter ({size} mm)", highlight=False, markup=False)
+    origin = " ".join(f"{1e3 * value:.2f}" for value in model.origin)
+    for line in (
+        f"added {model.name}: {1e3 * model.diameter:.1f} mm in diameter ({size} mm)",
+        f"origin_mm {origin}: the object frame's origin, its centroid, in the mesh file's frame",
+    ):
+        console.print(line, highlight=False, markup=False)
     folders = os.environ.get("ACTIVE6D_OBJECT_PATH", "").split(os.pathsep)
     if str(into) not in folders and str(into.resolve()) not in folders:
         console.print(f"export ACTIVE6D_OBJECT_PATH={into.resolve()}", highlight=False, markup=False)
@@ -151,15 +163,19 @@ def _symmetry_notes(known: "ModelSymmetry", model: "ObjectModel", scale: float) 
     return notes
 
 
-def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str) -> "ObjectModel":
+def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str, check_axis: bool) -> "ObjectModel":
     """Copy the mesh, write the description and read the object; nothing is left where that fails."""
     from active6d_core.object_model import read_description
+    from active6d_tools.axis_check import refuse_wrong_axis
 
     mesh_path.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(mesh, mesh_path)
     try:
         write_file(description_path, description)
-        return read_description(description_path)
+        model = read_description(description_path)
+        if check_axis:
+            refuse_wrong_axis(model)
+        return model
     except Exception as error:  # readers of meshes raise many kinds on damaged files
         description_path.unlink(missing_ok=True)
         mesh_path.unlink()
@@ -176,6 +192,7 @@ def _describe(model: "ObjectModel") -> dict[str, Any]:
         "name": model.name,
         "diameter_mm": round(1e3 * model.diameter, 2),
         "size_mm": (1e3 * model.mesh.extents).round(2).tolist(),
+        "origin_mm": (1e3 * model.origin).round(2).tolist(),
         "volume_ml": round(1e6 * float(model.mesh.volume), 2),
         "symmetry": symmetry,
         "instances": list(model.instances),

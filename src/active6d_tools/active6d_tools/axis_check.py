@@ -1,0 +1,49 @@
+"""Whether a mesh has the axis of continuous symmetry that a user names."""
+
+import numpy as np
+import open3d as o3d
+from scipy.spatial.transform import Rotation
+
+from active6d_core.object_model import ObjectModel
+
+#: Share of the diameter by which a turned surface may leave the surface. It is .03 for a bolt with a hexagonal head.
+_TOLERANCE = 0.05
+# The golden angle: no number of teeth or corners turns onto itself each time.
+_ANGLES = np.radians(137.508) * np.arange(1, 25)
+_POINTS = 4096
+
+
+def refuse_wrong_axis(model: ObjectModel) -> None:
+    """Refuse an axis about which the mesh cannot be turned.
+
+    Args:
+        model: an object with an axis of continuous symmetry.
+
+    Raises:
+        ValueError: the turned surface leaves the surface; the text has the distance and the axes that would do.
+    """
+    if model.symmetry.axis is None:
+        return
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(np.asarray(model.mesh.vertices, np.float32), np.asarray(model.mesh.faces, np.uint32))
+    deviation = _deviation(scene, model, model.symmetry.axis)
+    allowed = _TOLERANCE * model.diameter
+    if deviation <= allowed:
+        return
+    axes = zip(("x (1 0 0)", "y (0 1 0)", "z (0 0 1)"), np.eye(3), strict=True)
+    fits = [name for name, axis in axes if _deviation(scene, model, axis) <= allowed]
+    advice = f"--axis can be {' or '.join(fits)}" if fits else "none of x, y and z is one, so leave --axis out"
+    raise ValueError(
+        f"--axis is no axis of symmetry: turned about it through the centroid, the surface moves by up to "
+        f"{1e3 * deviation:.1f} mm, {1e3 * allowed:.1f} mm are allowed; {advice}"
+    )
+
+
+def _deviation(scene: o3d.t.geometry.RaycastingScene, model: ObjectModel, axis: np.ndarray) -> float:
+    """Largest distance of the turned surface from the surface, metres."""
+    vertices = np.asarray(model.mesh.vertices)
+    # Corners move most, and random points miss them.
+    points = np.concatenate([model.surface[0][:_POINTS], vertices[:: len(vertices) // _POINTS + 1]])
+    turns = Rotation.from_rotvec(_ANGLES[:, None] * axis).as_matrix()
+    moved = np.einsum("aij,nj->ani", turns, points).reshape(-1, 3)
+    return float(scene.compute_distance(moved.astype(np.float32), nthreads=1).numpy().max())
