@@ -131,7 +131,7 @@ class HypothesisFusionNode(GraphNode):
         self.declare(
             "bin_width",
             0.0,
-            "bin between its walls, world x, metres; objects in its walls are withdrawn; 0: not known",
+            "bin between its walls, world x, metres; what stands in them is withdrawn; 0: usual bin",
             minimum=0.0,
         )
         self.declare("bin_depth", 0.0, "bin between its walls, world y, metres; 0: as bin_width", minimum=0.0)

@@ -304,6 +304,7 @@ class JointFusion:
 
     def describe(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> JointObjects:
         """The objects of all views so far with what is known of them; arguments as for :meth:`objects`."""
+        self.in_walls = 0
         order = self._order()
         if not len(order):
             return JointObjects(SceneObjects.empty(), np.zeros((0, len(OBJECT_COLUMNS))))
