@@ -21,11 +21,11 @@ from active6d_bringup.camera.stream import (
     GateLimits,
     PoseHistory,
     Verdict,
-    nearest_position,
     pose_difference,
 )
 from active6d_bringup.camera.view_maker import ViewMaker
 from active6d_core.camera import View
+from active6d_core.nearest_stamp import nearest_position
 from active6d_core.ros.conversions import MessageError, pose_to_transform
 from active6d_core.ros.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_INFO, CAMERA_POSE
 from active6d_core.ros.transform_tree import TransformTree

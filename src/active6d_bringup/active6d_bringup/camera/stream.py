@@ -2,13 +2,14 @@
 
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any
 
 import numpy as np
 
+from active6d_core.nearest_stamp import nearest_position
 from active6d_core.se3 import rotation_angle
 
 SECOND = 1_000_000_000
@@ -53,13 +54,6 @@ class FrameMatcher:
         self.skew = None
         color, depth = ((stamp, image), best) if name == "color" else (best, (stamp, image))
         self._on_pair(color[0], color[1], depth[1])
-
-
-def nearest_position(stamps: Sequence[int], stamp: int) -> int | None:
-    """Position of the stamp nearest to another, of stamps in order; None where there is none."""
-    after = bisect_left(stamps, stamp)
-    around = range(max(after - 1, 0), min(after + 1, len(stamps)))
-    return min(around, key=lambda position: abs(stamps[position] - stamp), default=None)
 
 
 class PoseHistory:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from active6d_core.nearest_stamp import nearest_position
 from active6d_core.ros.conversions import MessageError, stamp_to_ns
 from active6d_core.se3 import invert, make_transform, transform_from_quaternion
 
@@ -104,9 +105,9 @@ class TransformTree:
 
     def _at(self, child: str, stamp: int, tolerance: int | None) -> np.ndarray:
         stamps, transforms = self._stamps[child], self._transforms[child]
-        after = bisect_left(stamps, stamp)
-        around = range(max(after - 1, 0), min(after + 1, len(stamps)))
-        nearest = min(around, key=lambda index: abs(stamps[index] - stamp))
+        nearest, after = nearest_position(stamps, stamp), bisect_left(stamps, stamp)
+        if nearest is None:
+            raise MessageError(f"there is no transform of {child}")
         late = abs(stamps[nearest] - stamp)
         if child in self._static or late <= (tolerance or 0):
             return transforms[nearest]
