@@ -112,13 +112,10 @@ class DirectRunner:
         state = EpisodeState(seen.view.stamp, self.limits)
         while True:
             view = seen.view
-            known = view.stamp, view.T_world_camera, seen.hypotheses, seen.verification
-            if isinstance(fusion, JointFusion):
-                fusion.add_view(*known, view.depth, view.camera)
-            else:
-                fusion.add_view(*known)
-            surface.add_view(view.stamp, view.depth, view.camera, view.T_world_camera)
-            shown = view.T_world_camera if seen.T_world_shown is None else seen.T_world_shown
+            pose, found = view.T_world_camera, (seen.hypotheses, seen.verification)
+            fusion.add_view(view.stamp, pose, *found, view.depth, view.camera)
+            surface.add_view(view.stamp, view.depth, view.camera, pose)
+            shown = pose if seen.T_world_shown is None else seen.T_world_shown
             objects = fusion.objects(view.stamp, shown, view.camera)
             episode.views.append(seen)
             episode.objects.append(objects)

@@ -229,13 +229,10 @@ class HypothesisFusionNode(GraphNode):
             check_in_front(hypotheses.T_camera_object)
         with self.measure(stamp) as summary:
             verification = self._verifier.score(values["depth"], values["camera"], hypotheses)
-            found = stamp, values["pose"], hypotheses, verification
-            if isinstance(self._fusion, JointFusion):
-                self._fusion.add_view(*found, values["depth"], values["camera"])
-            else:
-                self._fusion.add_view(*found)
+            measured = values["depth"], values["camera"]
+            self._fusion.add_view(stamp, values["pose"], hypotheses, verification, *measured)
             aligned = self._cameras.alignment(stamp)
-            self._surface.add_view(stamp, values["depth"], values["camera"], aligned.correction @ values["pose"])
+            self._surface.add_view(stamp, *measured, aligned.correction @ values["pose"])
             self._latest = stamp, values["pose"], values["camera"]
             objects = self._publish(*self._latest)
             confirmed = np.count_nonzero(objects.probability >= self._settings.confirmed)

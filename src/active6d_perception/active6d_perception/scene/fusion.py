@@ -203,9 +203,16 @@ class SceneFusion:
         self._known.forget_before(stamp)
 
     def add_view(
-        self, stamp: int, T_world_camera: np.ndarray, hypotheses: Hypotheses, verification: np.ndarray
+        self,
+        stamp: int,
+        T_world_camera: np.ndarray,
+        hypotheses: Hypotheses,
+        verification: np.ndarray,
+        depth: np.ndarray | None = None,
+        camera: PinholeCamera | None = None,
     ) -> bool:
-        """Add the hypotheses of one view; see :meth:`.HypothesisTable.add_view`."""
+        """Add the hypotheses of one view, see :meth:`.HypothesisTable.add_view`; fusion of all views also needs the
+        depth image."""
         return self._known.add_view(stamp, T_world_camera, hypotheses, verification)
 
     def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
