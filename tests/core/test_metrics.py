@@ -234,6 +234,16 @@ def test_scene_score_charges_the_missed_and_counts_each_hypothesis_once(models):
     assert score.mean_e_add_mm == pytest.approx(score.e_add_mm.mean())
 
 
+def test_a_confirmed_object_is_wrong_if_it_detects_none():
+    diameter, near, far = 0.1, 0.004, 0.011
+    errors = np.array([[near, far, far], [near, far, far], [far, near, far], [far, far, far], [far, far, np.inf]])
+    confirmed = np.array([True, True, False, True, False])
+    rate, count, wrong = metrics.score_confirmed(errors, confirmed, diameter)
+    assert (count, wrong) == (3, 1), "the second object at a place is not wrong"
+    assert rate == pytest.approx(1 / 3)
+    assert metrics.score_confirmed(errors, np.zeros(5, bool), diameter) == (0.0, 0, 0)
+
+
 def test_scene_score_without_hypotheses_and_without_objects(models):
     nothing = np.zeros((0, 4, 4))
     score = metrics.evaluate_scene(models["cup"], nothing, np.eye(4)[None])

@@ -187,6 +187,23 @@ def score_errors(errors: np.ndarray, diameter: float, missed: float = MISSED_E_A
     return SceneScore(1e3 * charged, matched, found & (charged < DETECTION_FRACTION * diameter))
 
 
+def score_confirmed(errors: np.ndarray, confirmed: np.ndarray, diameter: float) -> tuple[float, int, int]:
+    """What counts if only the confirmed ones of k reported objects do.
+
+    Args:
+        errors: (k, n) ADD in metres, as for :func:`score_errors`.
+        confirmed: (k,) bool.
+        diameter: the object's, metres.
+
+    Returns:
+        The fraction of the true objects that confirmed objects detect, the number of confirmed objects, and how many
+        of these detect no object. A second object at the same place is not counted as wrong.
+    """
+    own = errors[confirmed]
+    rate = score_errors(own, diameter).detection_rate
+    return rate, len(own), int((~(own < DETECTION_FRACTION * diameter).any(axis=1)).sum())
+
+
 def evaluate_scene(
     model: ObjectModel, T_est: np.ndarray, T_gt: np.ndarray, *, missed: float = MISSED_E_ADD
 ) -> SceneScore:

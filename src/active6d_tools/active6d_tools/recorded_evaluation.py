@@ -13,16 +13,20 @@ from active6d_agent.environment.rollout import EpisodeResults
 from active6d_agent.policies.episode_state import Limits
 from active6d_agent.policies.registry import create_policy
 from active6d_core.camera import backproject
-from active6d_core.metrics import evaluate_scene
+from active6d_core.metrics import MISSED_E_ADD, e_add, score_confirmed, score_errors
 from active6d_core.object_model import ObjectModel
 from active6d_core.registry import AUTOMATIC
 from active6d_core.se3 import invert
 from active6d_perception.active6d import check_span
-from active6d_perception.scene.fusion import SceneFusion
+from active6d_perception.model.ambiguity import ambiguity_of
+from active6d_perception.scene.camera_alignment import CameraAlignment
+from active6d_perception.scene.expected_visibility import OPEN_TABLE
+from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.measured_view import measure_view
 from active6d_sim.datasets.bop import CAMERA_FILE, TRUTH_FILE, BopScene
 from active6d_sim.datasets.bop_models import differs_from_data_set
 from active6d_tools.bop_results import BopEstimates
-from active6d_tools.direct_episode import DirectEpisode, DirectRunner, Perception
+from active6d_tools.direct_episode import DirectEpisode, DirectRunner, PerceivedView, Perception
 from active6d_tools.recorded_scene import RecordedCamera, RecordedScene, find_bin
 from active6d_tools.view_registration import register_views, upright
 
@@ -78,6 +82,8 @@ class RecordedEvaluation:
         warn: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._model, self._steps, self._seed = model, steps, seed
+        # A recording tells where its floor is, but not whether there are walls.
+        self._fusion = JointFusion(model, tray=OPEN_TABLE)
         perception = Perception(model, estimator)
         self.scenes: list[RecordedScene] = []
         #: BOP's number of the object.
@@ -123,19 +129,21 @@ class RecordedEvaluation:
             policy = create_policy(name, self._model, **{**own, **parameters})
             camera = RecordedCamera(scene, start)
             limits = Limits(scene.sphere, scene.allowed, self._steps)
-            # Fusion of all views needs to know the floor and the walls, which recordings do not tell.
-            runner = DirectRunner(self._model, limits, SceneFusion(self._model))
+            runner = DirectRunner(self._model, limits, self._fusion)
             episode = runner.run(policy, camera, np.random.default_rng([self._seed, number, start]))
             rows.append(self._score(number, episode, camera))
             estimates.append(_estimates(scene, episode, camera))
         return EpisodeResults(self.starts[:, 0], *map(np.array, zip(*rows, strict=True))), estimates
 
     def _score(self, number: int, episode: DirectEpisode, camera: RecordedCamera) -> tuple[Any, ...]:
-        score = evaluate_scene(self._model, episode.objects[-1].T_world_object, self._truths[number])
+        objects, diameter = episode.objects[-1], self._model.diameter
+        errors = e_add(self._model, objects.T_world_object[:, None], self._truths[number][None], cutoff=MISSED_E_ADD)
+        score = score_errors(errors, diameter)
+        sure = score_confirmed(errors, objects.probability >= self._fusion.parameters.confirmed, diameter)
         positions = np.array([seen.view.T_world_camera[:3, 3] for seen in episode.views])
         taken = camera.taken + [-1] * (self._steps + 1 - len(camera.taken))
         metres = self.scenes[number].sphere.path_length(positions)
-        return score.detection_rate, score.mean_e_add_mm, metres, taken
+        return score.detection_rate, score.mean_e_add_mm, metres, taken, *sure
 
     def _entropy(self, scene: RecordedScene) -> np.ndarray:
         of_image = {int(i): view_entropy(scene.perceive(int(i)).hypotheses.segmentation) for i in set(scene.nearest)}
@@ -167,7 +175,7 @@ def _estimates(scene: RecordedScene, episode: DirectEpisode, camera: RecordedCam
         int(name) if name.isdecimal() else 0,
         scene.recording.image_ids[index],
         invert(scene.T_bin_camera[index]) @ objects.T_world_object,
-        objects.score,
+        objects.probability,
         sum(seen.seconds for seen in episode.views),
     )
 
@@ -187,16 +195,28 @@ def _place(recording: BopScene, model: ObjectModel, perception: Perception, warn
             f"{folder}: {sum(missing)} of {len(missing)} images have no camera pose; remove these images from "
             f"{CAMERA_FILE}, or all poses: then images are placed by the objects in them"
         )
-    centres = []
-    for index in range(len(recording)):
-        found = perception(recording.view(index, index + 1)).hypotheses
-        centres.append(found.T_camera_object[found.score >= _SURE, :3, 3])
-    try:
-        poses = register_views(centres, model.diameter)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from error
-    warn(f"{folder.name}: no camera poses; the {len(poses)} images are placed by the objects in them")
+    views = [perception(recording.view(index, index + 1)) for index in range(len(recording))]
+    sure = [seen.hypotheses.T_camera_object[seen.hypotheses.score >= _SURE] for seen in views]
+    placed, left_out = register_views(sure, model)
+    why = "; ".join(f"image {recording.image_ids[index]}: {reason}" for index, reason in left_out.items())
+    if len(placed) < min(2, len(recording)):
+        raise ValueError(f"{folder}: has no camera poses, and no two images can be placed by their objects: {why}")
+    warn(f"{folder.name}: no camera poses; {len(placed)} images are placed by the objects in them")
+    if left_out:
+        warn(f"{folder.name}: {len(left_out)} of {len(views)} images cannot be placed and are left out: {why}")
+    recording = recording.take(list(placed))
+    poses = _align([views[index] for index in placed], np.array(list(placed.values())), model)
     return replace(recording, T_world_camera=upright(poses, *_largest_plane(recording)))
+
+
+def _align(views: Sequence[PerceivedView], poses: np.ndarray, model: ObjectModel) -> np.ndarray:
+    """(m, 4, 4) camera poses corrected by the depth images: positions of objects place a camera to centimetres."""
+    cameras = CameraAlignment()
+    for seen, T in zip(views, poses, strict=True):
+        view = seen.view
+        cameras.add_view(view.stamp, measure_view(view.depth, view.camera, T, seen.hypotheses, ambiguity_of(model)))
+    corrections = [cameras.alignment(seen.view.stamp).correction for seen in views]
+    return np.array(corrections) @ poses
 
 
 def _largest_plane(recording: BopScene) -> tuple[np.ndarray, np.ndarray]:

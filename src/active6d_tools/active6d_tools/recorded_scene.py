@@ -19,6 +19,13 @@ from active6d_tools.direct_episode import PerceivedView, Perception
 _REACH = np.radians(20.0)
 #: True poses in different images that are closer than this fraction of the diameter are one object.
 _SAME_OBJECT = 0.25
+#: Optical axes that differ less than this do not tell where they cross, radians.
+_PARALLEL = np.radians(10.0)
+#: What is below z = 0 by more than this fraction of the diameter shows that the floor is lower.
+_BELOW_FLOOR = 0.1
+#: Within so many metres, a floor has so many times more points than as much height above it. Under 12 simulated piles,
+#: the floor had .019 to .074 of all points, and heights between the objects .004 to .009.
+_FLOOR_RATIO, _FLAT = 1.5, 0.005
 
 
 class RecordedScene:
@@ -145,7 +152,8 @@ def turn_boxes(boxes: np.ndarray, turn: np.ndarray, camera: PinholeCamera) -> np
 def find_bin(scene: BopScene, model: ObjectModel, warn: Callable[[str], None] = lambda text: None) -> np.ndarray:
     """(m, 4, 4) ``T_bin_camera`` of a recording with camera poses: the world is moved to where the cameras look.
 
-    A world whose origin the cameras look at, as this project writes it, stays as it is.
+    A world whose origin the cameras look at, as this project writes it, stays as it is if nothing is below its floor.
+    Where no floor can be seen under the objects, z = 0 is a diameter below what is seen, so that no object is cut.
 
     Raises:
         ValueError: most cameras look up, so that the world's z axis is not up.
@@ -153,24 +161,59 @@ def find_bin(scene: BopScene, model: ObjectModel, warn: Callable[[str], None] = 
     T = scene.T_world_camera
     if np.median(T[:, 2, 2]) > -0.05:
         raise ValueError(f"{scene.folder}: the cameras do not look down, so the world's z axis is not up")
-    # The point nearest to all optical axes: projections onto the planes across them.
-    across = np.eye(3) - T[:, :3, 2, None] * T[:, None, :3, 2]
-    middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, T[:, :3, 3]), rcond=None)[0]
-    if np.linalg.norm(middle) < model.diameter:
+    middle = _looked_at(scene)
+    in_place = np.linalg.norm(middle) < model.diameter
+    if in_place:
+        middle = np.zeros(3)
+    floor, is_seen = _floor(scene, middle, model)
+    if in_place and floor > -_BELOW_FLOOR * model.diameter:
         return T
-    floor = _floor(scene, middle, model)
-    shift = np.array([middle[0], middle[1], floor])
-    place = np.round(middle, 3).tolist()
-    warn(f"{scene.folder.name}: the cameras look at {place} m, and the bin's floor is taken to be at {floor:.3f} m")
-    return make_transform(np.eye(3), -shift) @ T
+    if not is_seen:
+        floor -= model.diameter
+    place, taken = np.round(middle, 3).tolist(), "the bin's floor is" if is_seen else "no floor is seen; it is"
+    warn(f"{scene.folder.name}: the cameras look at {place} m, and {taken} taken to be at {floor:.3f} m")
+    return make_transform(np.eye(3), -np.array([middle[0], middle[1], floor])) @ T
 
 
-def _floor(scene: BopScene, middle: np.ndarray, model: ObjectModel) -> float:
-    """Height of what lies under the objects: a low quantile of the depth around the middle, metres."""
+def _looked_at(scene: BopScene) -> np.ndarray:
+    """(3,) the point nearest to all optical axes; along nearly parallel axes, the depth in their middle decides."""
+    T, seen = scene.T_world_camera, []
+    for index in _some(scene):
+        view = scene.view(index, 0)
+        rows, columns = (slice(size // 3, -(-2 * size // 3)) for size in view.depth.shape)
+        depth = view.depth[rows, columns]
+        if np.isfinite(depth).any():
+            seen.append(transform_points(T[index], np.array([[0.0, 0.0, np.nanmedian(depth)]]))[0])
+    near = np.median(seen, axis=0) if seen else np.zeros(3)
+    # Projections onto the planes across the axes.
+    across = np.eye(3) - T[:, :3, 2, None] * T[:, None, :3, 2]
+    off = np.einsum("nij,nj->i", across, T[:, :3, 3] - near)
+    strength, direction = np.linalg.eigh(across.sum(axis=0))
+    known = strength > len(T) * np.sin(_PARALLEL) ** 2
+    return near + direction[:, known] @ ((direction[:, known].T @ off) / strength[known])
+
+
+def _some(scene: BopScene) -> list[int]:
+    """Up to five views, evenly spaced."""
+    return np.unique(np.linspace(0, len(scene) - 1, 5).astype(int)).tolist()
+
+
+def _floor(scene: BopScene, middle: np.ndarray, model: ObjectModel) -> tuple[float, bool]:
+    """Height of what lies under the objects, metres, and whether it is a surface of one height.
+
+    It is near a low quantile of the heights around the middle. Little of the floor is seen between the objects of a
+    pile, but more than of the heights just above it. Where the floor is hidden, it is the other way round.
+    """
     heights = []
-    for index in np.unique(np.linspace(0, len(scene) - 1, 5).astype(int)):
-        view = scene.view(int(index), 0)
+    for index in _some(scene):
+        view = scene.view(index, 0)
         points = transform_points(view.T_world_camera, backproject(view.depth, view.camera)[np.isfinite(view.depth)])
         near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < model.bin_width / 2
         heights.append(points[near, 2])
-    return float(np.quantile(np.concatenate(heights), 0.05))
+    height = np.concatenate(heights)
+    if not len(height):
+        raise ValueError(f"{scene.folder}: no depth where the cameras look, at {np.round(middle, 3).tolist()} m")
+    off = height - np.quantile(height, 0.01)
+    above = np.count_nonzero((off > _FLAT) & (off < 3 * _FLAT))
+    near = height[np.abs(off) < _FLAT]
+    return float(np.median(near)), bool(len(near) > _FLOOR_RATIO * above)

@@ -11,7 +11,7 @@ import numpy as np
 
 from active6d_agent.bank.scene_lookup import FusedBatch, SceneLookup
 from active6d_agent.policies.registry import Observation
-from active6d_core.metrics import DETECTION_FRACTION, score_errors
+from active6d_core.metrics import score_confirmed
 
 MEASURES = ("detection_rate", "e_add_mm", "distance_m")
 #: Measures of the objects that are confirmed by their probability.
@@ -162,10 +162,10 @@ def _score_confirmed(
     lookup: SceneLookup, fused: FusedBatch, scene: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(E,) fraction of the objects that confirmed ones find, number of these, and how many of them find none."""
-    limit, rate, wrong = DETECTION_FRACTION * lookup.model.diameter, np.zeros(len(scene)), np.zeros(len(scene))
     sure = (fused.objects >= 0) & (fused.probability >= lookup.parameters.confirmed)
-    for row, (objects, own, count) in enumerate(zip(fused.objects, sure, lookup.object_count[scene], strict=True)):
+    rows = []
+    for objects, own, count in zip(fused.objects, sure, lookup.object_count[scene], strict=True):
         errors = lookup.errors[objects[own], :count]
-        rate[row] = score_errors(errors, lookup.model.diameter).detection_rate
-        wrong[row] = (~(errors < limit).any(axis=1)).sum()
-    return rate, sure.sum(axis=1).astype(float), wrong
+        rows.append(score_confirmed(errors, np.ones(len(errors), bool), lookup.model.diameter))
+    rate, confirmed, wrong = np.array(rows, float).reshape(-1, 3).T
+    return rate, confirmed, wrong

@@ -9,7 +9,7 @@ millimetres on disk and metres here.
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,17 @@ class BopScene:
 
     def __len__(self) -> int:
         return len(self.image_ids)
+
+    def take(self, index: Sequence[int]) -> "BopScene":
+        """The recording of some of its views, in that order."""
+        return BopScene(
+            self.folder,
+            tuple(self.image_ids[i] for i in index),
+            tuple(self.cameras[i] for i in index),
+            self.T_world_camera[list(index)],
+            tuple(self.depth_scale[i] for i in index),
+            None if self.truth is None else tuple(self.truth[i] for i in index),
+        )
 
     def view(self, index: int, stamp: int) -> View:
         """Read the ``index``-th view and give it the stamp ``stamp`` (nanoseconds).
