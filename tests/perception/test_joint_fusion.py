@@ -124,6 +124,15 @@ def test_what_stands_in_a_wall_is_withdrawn_where_the_walls_are_known(mug, episo
         assert fusion.in_walls == (2 if width < 0.2 and walled else 0)
 
 
+@pytest.mark.parametrize(("shift", "below"), [(0.05, 0), (-0.005, 0), (-0.03, 2)])
+def test_objects_below_the_floor_are_counted(mug, episode, shift, below):
+    fusion = JointFusion(mug, weights=hand_set_weights())
+    for stamp, T, *rest in episode:
+        fusion.add_view(stamp, make_transform(np.eye(3), [0.0, 0.0, shift]) @ T, *rest)
+    objects_of(fusion, episode[-1])
+    assert fusion.below_floor == below
+
+
 def resized(T, scale):
     moved = T.copy()
     moved[..., :3, 3] *= scale

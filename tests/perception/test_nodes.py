@@ -29,7 +29,7 @@ from active6d_core.ros.conversions import (
     stamp_to_ns,
     transform_to_pose_stamped,
 )
-from active6d_core.se3 import make_transform
+from active6d_core.se3 import invert, make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.nodes.hypothesis_fusion import HypothesisFusionNode
@@ -290,6 +290,26 @@ def test_fusion_from_all_views_is_that_of_the_core(graph, seen, tmp_path, monkey
         np.testing.assert_allclose(getattr(published, name), getattr(expected, name), atol=1e-3, err_msg=name)
     assert 0.5 < published.probability[0] < 0.99
     assert markers[0].markers[1].color.a == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(("height", "is_said"), [(0.05, False), (-0.02, True)])
+def test_a_floor_that_is_too_high_is_said_once(graph, render, tmp_path, monkeypatch, height, is_said):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    T_world_camera = SPHERE.pose(SPHERE.positions[3])
+    model, places = load_object("mug"), np.array([[-0.08, 0.0, height], [0.08, 0.0, height]])
+    T = invert(T_world_camera) @ make_transform(np.tile(np.eye(3), (2, 1, 1)), places)
+    depths = np.stack([render(model, each[None], CAMERA)[0] for each in T])
+    depth = np.fmin(*depths)
+    mask = np.where(np.isfinite(depth), 1 + (depths[1] == depth), 0).astype(np.uint16)
+    hypotheses = Hypotheses.from_masks(T, np.array([0.9, 0.9]), np.ones(2), mask, depth)
+    graph.add(HypothesisFusionNode(context=graph.context))
+    objects, statuses = graph.mailbox(PointCloud2, "objects", True), graph.mailbox(DiagnosticArray, "/diagnostics")
+    for number in (1, 2):
+        send(graph, fusion_messages((depth, hypotheses), number * SECOND), FUSION_INPUTS)
+        graph.spin_until_filled([objects], number)
+    graph.spin_until_filled([statuses])
+    texts = [status.message for each in statuses for status in each.status]
+    assert sum("2 objects reach more than 1 cm below the bin's floor" in text for text in texts) == is_said
 
 
 def test_wrong_camera_poses_are_corrected_and_reported(graph, tmp_path, monkeypatch):

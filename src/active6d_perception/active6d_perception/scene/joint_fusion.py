@@ -48,6 +48,8 @@ _BODY_GATES, _BODY_LATTICE = (0.008, 0.004, 0.004), 0.002
 WHOLE_GATES, _WHOLE_LATTICE = (0.008, 0.004), 0.0005
 #: A body with more of its surface than this beyond a wall stands in it.
 _IN_WALL = 0.25
+#: A body that reaches deeper below the floor than this is wrong, or the floor is; metres.
+_SUNK = 0.012
 #: A body whose log-odds are this far below those of the best at its place is dropped.
 HOPELESS = 12.0
 # Evidence is taken at poses on this lattice, metres.
@@ -108,8 +110,8 @@ class JointFusion:
     ) -> None:
         self.parameters = parameters or FusionParameters()
         self._align, self.cameras, self._walled = align, CameraAlignment(), walled
-        #: How many objects were last withdrawn because they stand in a wall.
-        self.in_walls = 0
+        #: How many objects were last withdrawn because they stand in a wall, and how many reach below the floor.
+        self.in_walls = self.below_floor = 0
         self.ambiguity: Ambiguity = ambiguity_of(model)
         self.weights = weights or load_belief(belief_path(model.name))
         self._tray = tray or Tray.for_model(model)
@@ -304,7 +306,7 @@ class JointFusion:
 
     def describe(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> JointObjects:
         """The objects of all views so far with what is known of them; arguments as for :meth:`objects`."""
-        self.in_walls = 0
+        self.in_walls = self.below_floor = 0
         order = self._order()
         if not len(order):
             return JointObjects(SceneObjects.empty(), np.zeros((0, len(OBJECT_COLUMNS))))
@@ -316,10 +318,7 @@ class JointFusion:
         apart, members = self._members(T, hypotheses)
         description = describe_objects(evidence, beliefs, members, table[:, 1], stamps)
         probability = expit(self.weights.probability(description))
-        if self._walled:
-            impossible = evidence.bodies.container[beliefs.candidate, 2] > _IN_WALL
-            self.in_walls = int((impossible & (probability >= self.parameters.confirmed)).sum())
-            probability = np.where(impossible, 0.0, probability)
+        probability = self._check_container(evidence.bodies.container[beliefs.candidate], probability)
         first = np.argsort(-probability, kind="stable")
         first = first[probability[first] >= self.parameters.least_probability]
         apart_enough = self.parameters.exclusion * ambiguity.diameter
@@ -363,6 +362,15 @@ class JointFusion:
         )
         members[alone, np.linalg.norm(middles[:, None] - others, axis=-1).argmin(axis=1)] = True
         return apart, members
+
+    def _check_container(self, container: np.ndarray, probability: np.ndarray) -> np.ndarray:
+        """(n,) probabilities, 0 of objects in walls; counts these and objects below the floor, by (n, 5) columns."""
+        self.below_floor = int(np.count_nonzero(container[:, 1] < -_SUNK))
+        if not self._walled:
+            return probability
+        impossible = container[:, 2] > _IN_WALL
+        self.in_walls = int((impossible & (probability >= self.parameters.confirmed)).sum())
+        return np.where(impossible, 0.0, probability)
 
     def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
         """The objects of all views so far, most probable first; arguments and features as for
