@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.evaluation import ablations as ablation
 from active6d_agent.evaluation.policy_evaluation import all_starts, run_named
 from active6d_agent.policies.attention.ppo import PpoParameters
 from active6d_agent.policies.view_attention.network import ViewAttention, save_network
 from active6d_core.metrics import evaluate_scene
-from active6d_perception.scene.fusion import RANKINGS
+from active6d_perception.scene.fusion_parameters import RANKINGS
 
 
 def by_variant(rows):
@@ -22,7 +22,7 @@ def by_variant(rows):
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BatchedFusion(synthetic_bank("mug", scenes=2, objects=6))
+    return BestViewLookup(synthetic_bank("mug", scenes=2, objects=6))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 import torch
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.environment.gym_environment import Active6DEnv, Active6DVectorEnv
 from active6d_agent.policies.attention.network import (
@@ -25,7 +25,7 @@ from active6d_agent.policies.registry import Observation, create_policy
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BatchedFusion(synthetic_bank("mug"))
+    return BestViewLookup(synthetic_bank("mug"))
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from ros_harness import GraphHarness, reliable
 from sensor_msgs.msg import PointCloud2
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.environment.gym_environment import Active6DEnv
 from active6d_agent.nodes import attention_policy
 from active6d_agent.nodes.attention_policy import AttentionPolicyNode
@@ -491,7 +491,7 @@ def test_an_empty_scene_still_moves(episode, make_objects):
 def test_the_node_chooses_what_the_environment_would(episode, tmp_path):
     """The paper's network, once behind topics and once on a bank: the same views and the same attended objects."""
     torch.manual_seed(0)
-    network, lookup = AttentionNetwork().eval(), BatchedFusion(synthetic_bank("mug", scenes=1))
+    network, lookup = AttentionNetwork().eval(), BestViewLookup(synthetic_bank("mug", scenes=1))
     save_network(network, tmp_path / "weights.safetensors")
     parameters = f"{{weights: {tmp_path / 'weights.safetensors'}}}"
     played = episode(policy="attention", policy_parameters=parameters, steps=3)

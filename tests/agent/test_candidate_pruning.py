@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from active6d_agent.bank.all_views_lookup import AllViewsLookup
 from active6d_agent.bank.candidate_pruning import prune_candidates
-from active6d_agent.bank.joint_lookup import JointLookup
 from active6d_agent.bank.scene_bank import SHIPPED_BANKS, bank_path, load_bank
 from active6d_core.se3 import make_transform
 
@@ -45,7 +45,7 @@ def test_hopeless_candidates_go_and_what_is_found_stays(bank):
     assert sorted(set(kept.place)) == list(range(kept.place.max() + 1))
     found = []
     for each in (larger, pruned):
-        lookup, rng = JointLookup(each), np.random.default_rng(1)
+        lookup, rng = AllViewsLookup(each), np.random.default_rng(1)
         views = np.stack([rng.choice(100, 6, replace=False) for _ in range(100)])
         scene = np.zeros(100, int)
         found.append(

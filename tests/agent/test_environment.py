@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.environment.episodes import RewardParameters
 from active6d_agent.environment.gym_environment import Active6DEnv, Active6DVectorEnv
 from active6d_agent.environment.gym_registration import ENVIRONMENT_ID
@@ -21,19 +21,20 @@ from active6d_core.camera import DEFAULT_CAMERA
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import e_add, evaluate_scene
 from active6d_core.se3 import transform_from_quaternion
-from active6d_perception.scene.fusion import FusionParameters, SceneFusion
+from active6d_perception.scene.best_view_fusion import BestViewFusion
+from active6d_perception.scene.fusion_parameters import FusionParameters
 
 EPISODE = [12, 57, 3, 80, 44, 99]
 
 
 @pytest.fixture(scope="module", params=["mug", "coffee_cup"])
 def lookup(request):
-    return BatchedFusion(synthetic_bank(request.param))
+    return BestViewLookup(synthetic_bank(request.param))
 
 
 def fuse_as_the_node_does(lookup, scene, views, parameters=None):
     """Feed the views to the class that the fusion node runs."""
-    bank_scene, fusion = lookup.bank.scenes[scene], SceneFusion(lookup.model, parameters)
+    bank_scene, fusion = lookup.bank.scenes[scene], BestViewFusion(lookup.model, parameters)
     for view in views:
         table = bank_scene.table[bank_scene.view == view].astype(float)
         T_world_camera = lookup.sphere.pose(lookup.sphere.positions[view])
@@ -54,7 +55,7 @@ def test_fusion_is_the_nodes(lookup, scene, views):
 
 def test_fusion_parameters_are_honoured():
     parameters = FusionParameters(cut=0.1, exclusion=0.4, min_verification=0.5)
-    lookup = BatchedFusion(synthetic_bank("mug", scenes=1), parameters)
+    lookup = BestViewLookup(synthetic_bank("mug", scenes=1), parameters)
     expected, actual = fuse_as_the_node_does(lookup, 0, EPISODE, parameters), lookup.objects(0, EPISODE)
     np.testing.assert_allclose(actual.T_world_object, expected.T_world_object, atol=1e-9)
 

@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.environment.gym_environment import Active6DEnv
 from active6d_agent.evaluation import oracle
 from active6d_agent.evaluation import policy_evaluation as evaluation
@@ -17,7 +17,7 @@ from active6d_core.metrics import DETECTION_FRACTION, e_add, evaluate_scene
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BatchedFusion(synthetic_bank("mug"))
+    return BestViewLookup(synthetic_bank("mug"))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.environment.rollout import measure
 from active6d_agent.evaluation.noise_resampling import ablate_noise_resampling, join_banks, search_unforeseen
 from active6d_agent.evaluation.oracle import search_views, worth
@@ -18,7 +18,7 @@ STEPS = 3
 
 @pytest.fixture(scope="module")
 def lookups():
-    return tuple(BatchedFusion(synthetic_bank("mug", scenes=2, objects=6, noise=noise)) for noise in (0, 1))
+    return tuple(BestViewLookup(synthetic_bank("mug", scenes=2, objects=6, noise=noise)) for noise in (0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_the_joined_bank_is_either_bank(lookups):
     }
     order = np.argsort(fields["view"], kind="stable")
     by_hand = replace(first, **{field: values[order] for field, values in fields.items()})
-    alone = BatchedFusion(replace(lookups[0].bank, scenes=[by_hand]))
+    alone = BestViewLookup(replace(lookups[0].bank, scenes=[by_hand]))
     assert worth(joined, scene[:1], mixed[:1]) == pytest.approx(worth(alone, np.array([0]), views[:1]))
 
 
@@ -111,7 +111,7 @@ def test_banks_of_something_else_are_refused(lookups, starts, change):
     bank = lookups[1].bank
     change = {key: bank.scenes[value] if key == "scenes" else value for key, value in change.items()}
     with pytest.raises(ValueError, match="differ in more than their seed"):
-        next(ablate_noise_resampling((lookups[0], BatchedFusion(replace(bank, **change))), [], starts, 1))
+        next(ablate_noise_resampling((lookups[0], BestViewLookup(replace(bank, **change))), [], starts, 1))
 
 
 def test_no_gap_is_refused(lookups, starts):

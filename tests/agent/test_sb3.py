@@ -8,7 +8,7 @@ import torch
 from stable_baselines3 import A2C, PPO, SAC
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.environment.gym_environment import Active6DEnv
 from active6d_agent.evaluation.policy_evaluation import run_named
 from active6d_agent.policies.registry import create_policy
@@ -18,7 +18,7 @@ from active6d_core.object_model import load_object
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BatchedFusion(synthetic_bank("mug", scenes=1))
+    return BestViewLookup(synthetic_bank("mug", scenes=1))
 
 
 @pytest.mark.parametrize(

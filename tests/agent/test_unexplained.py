@@ -6,7 +6,7 @@ from hand_made_scenes import three_mugs
 from sensor_msgs.msg import PointCloud2
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.bank.observation import observe_scene
 from active6d_agent.bank.scene_bank import SceneBank, load_bank
 from active6d_agent.environment.rollout import observe
@@ -60,7 +60,7 @@ def lookup(simulator, tmp_path_factory):
     seen = observe_scene(scene.name, scene.T_world_object, simulator.capture, estimator, verifier, model, SPHERE, grid)
     path = tmp_path_factory.mktemp("bank") / "bank.npz"
     SceneBank("mug", SPHERE, grid, [seen], {}).save(path)
-    return BatchedFusion(load_bank(path))
+    return BestViewLookup(load_bank(path))
 
 
 def unexplained(lookup, views):
@@ -105,7 +105,7 @@ def test_the_node_publishes_what_the_bank_says(graph, tmp_path, monkeypatch, loo
 
 def test_observations_hold_what_each_episode_has_seen():
     """Side by side, with episodes of different lengths, as cell by cell."""
-    lookup = BatchedFusion(synthetic_bank("coffee_cup", scenes=2, objects=6))
+    lookup = BestViewLookup(synthetic_bank("coffee_cup", scenes=2, objects=6))
     rng = np.random.default_rng(0)
     scene = np.array([0, 1, 1, 0, 1])
     views = np.stack([rng.choice(100, 4, replace=False) for _ in scene])

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from synthetic_bank import synthetic_bank
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.environment.rollout import observe
 from active6d_agent.evaluation.oracle import known, search_views, tally, worth
 from active6d_agent.evaluation.policy_evaluation import all_starts, run_named, run_policy
@@ -41,7 +41,7 @@ from active6d_perception.scene.expected_visibility import Tray, expected_visibil
 
 @pytest.fixture(scope="module")
 def lookup():
-    return BatchedFusion(synthetic_bank("mug", scenes=2, objects=8))
+    return BestViewLookup(synthetic_bank("mug", scenes=2, objects=8))
 
 
 @pytest.fixture(scope="module")
@@ -574,7 +574,7 @@ def test_training_and_deployment_move_alike(lookup, network, policy):
 
 @pytest.mark.slow
 def test_an_interrupted_training_goes_on_between_evaluations(tmp_path, monkeypatch):
-    lookup = BatchedFusion(synthetic_bank("mug", scenes=2, objects=3))
+    lookup = BestViewLookup(synthetic_bank("mug", scenes=2, objects=3))
     settings = {"episodes": 2, "updates": 2, "longest": 2, "steps": 2, "starts": 4, "batch": 8}
     parameters = dagger.DaggerParameters(rounds=3, evaluate_every=3, **settings)
     monkeypatch.setattr("active6d_core.files.Checkpoints.due", lambda self: True)
@@ -596,7 +596,7 @@ def test_an_interrupted_training_goes_on_between_evaluations(tmp_path, monkeypat
 
 
 def test_it_learns_its_way_past_random_and_resumes(tmp_path):
-    lookup = BatchedFusion(synthetic_bank("mug", scenes=3, objects=12))
+    lookup = BestViewLookup(synthetic_bank("mug", scenes=3, objects=12))
     starts = all_starts(lookup, 40, 0)
     random = run_named(lookup, "random", starts, 4)
     settings = {"episodes": 10, "updates": 60, "longest": 4, "steps": 4, "starts": 40, "batch": 48, "certainty": 0.0}

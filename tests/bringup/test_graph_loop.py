@@ -28,7 +28,7 @@ from active6d_core.ros.topics import CONTRACT, Per
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator
-from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.observed_surface import ObservedSurface
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.active_stereo import ActiveStereo
@@ -133,7 +133,7 @@ def test_images_are_the_simulators(record, scene, settings):
 
 def test_perception_and_policy_are_the_core_functions(record):
     model = load_object("mug")
-    estimator, verifier, fusion = create_estimator("geometric", model), Verifier(model), JointFusion(model)
+    estimator, verifier, fusion = create_estimator("geometric", model), Verifier(model), AllViewsFusion(model)
     surface = ObservedSurface(model)
     policy = create_policy("auto", model)
     policy.reset(np.random.default_rng([3, record.steps[0].stamp]))

@@ -10,8 +10,8 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform, rotation_angle, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.ambiguity import ambiguity_of
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.camera_alignment import CameraAlignment
-from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.measured_view import MeasuredView, measure_view, move_view
 from active6d_sim.rendering.pose_error import PoseError
 from active6d_sim.rendering.random_sensor import sensor_of
@@ -169,7 +169,7 @@ def test_fusion_reports_objects_where_the_corrected_cameras_see_them(scene, meas
     camera = PinholeCamera.from_field_of_view(640, 480, 60.0)
     errors = {}
     for align in (True, False):
-        fusion = JointFusion(mug, align=align)
+        fusion = AllViewsFusion(mug, align=align)
         for stamp, (view, true) in enumerate(zip(wrong, measured, strict=True)):
             T_camera_object = true.T_camera_world @ T_true
             row = np.linspace(0.6, 0.9, len(T_true))

@@ -11,11 +11,11 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.compiled import compiled
 from active6d_perception.model import model_views
 from active6d_perception.scene import (
+    all_views_fusion,
+    best_view_fusion,
     body_refinement,
     camera_alignment,
     feasibility,
-    fusion,
-    joint_fusion,
     measured_cases,
     measured_view,
     pose_lattice,
@@ -24,8 +24,8 @@ from active6d_perception.scene import (
 from active6d_perception.scene import expected_visibility as visibility
 from active6d_perception.scene import observed_surface as surface
 
-JOINT = (body_refinement, camera_alignment, feasibility, measured_cases, measured_view, pose_lattice)
-MODULES = (fusion, model_views, surface, verification, visibility, *JOINT)
+ALL_VIEWS = (body_refinement, camera_alignment, feasibility, measured_cases, measured_view, pose_lattice)
+MODULES = (best_view_fusion, model_views, surface, verification, visibility, *ALL_VIEWS)
 
 
 def versions():
@@ -43,7 +43,7 @@ def test_no_view_waits_for_the_compiler(render, pose):
     model = load_object("mug")
     verifier, scene = verification.Verifier(model), surface.ObservedSurface(model)
     visible = visibility.ExpectedVisibility(model)
-    fused, joint = fusion.SceneFusion(model), joint_fusion.JointFusion(model)
+    best, every = best_view_fusion.BestViewFusion(model), all_views_fusion.AllViewsFusion(model)
     compiled = versions()
     assert sum(compiled.values()) >= 8
     depth = render(model, pose(0))[0].copy()
@@ -55,10 +55,10 @@ def test_no_view_waits_for_the_compiler(render, pose):
         hypotheses = Hypotheses.from_masks(pose(0), np.ones(1), np.ones(1), mask, depth)
         assert verifier.score(depth, DEFAULT_CAMERA, hypotheses) > 0.9
         scene.add_view(1, depth, DEFAULT_CAMERA, T_world_camera)
-        fused.add_view(int(writable), T_world_camera, hypotheses, np.ones(1))
-        assert len(fused.objects(int(writable), T_world_camera, DEFAULT_CAMERA)) == 1
-        joint.add_view(int(writable), T_world_camera, hypotheses, np.ones(1), depth, DEFAULT_CAMERA)
-        assert len(joint.objects(int(writable), T_world_camera, DEFAULT_CAMERA)) == 1
+        best.add_view(int(writable), T_world_camera, hypotheses, np.ones(1))
+        assert len(best.objects(int(writable), T_world_camera, DEFAULT_CAMERA)) == 1
+        every.add_view(int(writable), T_world_camera, hypotheses, np.ones(1), depth, DEFAULT_CAMERA)
+        assert len(every.objects(int(writable), T_world_camera, DEFAULT_CAMERA)) == 1
         T_world_object = T_world_camera @ pose(0)
         scene.unexplained(T_world_object)
         for tray in (None, visibility.Tray.for_model(model)):

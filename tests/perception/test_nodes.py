@@ -34,10 +34,10 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import register_estimator
 from active6d_perception.nodes.hypothesis_fusion import HypothesisFusionNode
 from active6d_perception.nodes.pose_estimator import PoseEstimatorNode
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer, belief_file
+from active6d_perception.scene.best_view_fusion import BestViewFusion
 from active6d_perception.scene.expected_visibility import Tray
-from active6d_perception.scene.fusion import SceneFusion
-from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
 from active6d_perception.scene.verification import Verifier
@@ -256,7 +256,7 @@ def test_fusion_by_the_best_view_publishes_verified_objects(graph, seen, tmp_pat
     depth, hypotheses = seen
     model = load_object("mug")
     T_world_camera = SPHERE.pose(SPHERE.positions[3])
-    core = SceneFusion(model)
+    core = BestViewFusion(model)
     core.add_view(SECOND, T_world_camera, hypotheses, Verifier(model).score(depth, CAMERA, hypotheses))
     expected = core.objects(SECOND, T_world_camera, CAMERA)
     published = objects_from_cloud(objects[0], "world")
@@ -281,7 +281,7 @@ def test_fusion_from_all_views_is_that_of_the_core(graph, seen, tmp_path, monkey
     depth, hypotheses = seen
     model = load_object("mug")
     T_world_camera = SPHERE.pose(SPHERE.positions[3])
-    core = JointFusion(model, weights=weights, tray=Tray(0.5, 0.4, 0.0))
+    core = AllViewsFusion(model, weights=weights, tray=Tray(0.5, 0.4, 0.0))
     verification = Verifier(model).score(depth, CAMERA, hypotheses)
     core.add_view(SECOND, T_world_camera, hypotheses, verification, depth, CAMERA)
     expected = core.objects(SECOND, T_world_camera, CAMERA)

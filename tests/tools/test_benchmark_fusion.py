@@ -9,7 +9,7 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.se3 import invert, rotation_angle, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.belief_weights import BeliefWeights
-from active6d_perception.scene.fusion import FusionParameters
+from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_perception.scene.measured_view import MeasuredView
 from active6d_sim.rendering.pose_error import PoseError
 from active6d_tools.benchmark.camera_errors import error_panels, measure_errors, parse_errors
@@ -45,7 +45,7 @@ def stored_mugs(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_methods_fuse_the_same_views(stored_mugs, monkeypatch):
     indifferent = lambda path: BeliefWeights.indifferent()
-    monkeypatch.setattr("active6d_perception.scene.joint_fusion.load_belief", indifferent)
+    monkeypatch.setattr("active6d_perception.scene.all_views_fusion.load_belief", indifferent)
     results = compare_methods([stored_mugs], kinds=("ring",), episodes=1, parameters=FusionParameters(confirmed=0.0))
     assert set(results["ring"]) == {"best-view", "all-views"}
     for row in results["ring"].values():

@@ -8,11 +8,11 @@ import pytest
 from synthetic_bank import synthetic_bank
 from typer.testing import CliRunner
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.bank.scene_bank import bank_path, find_bank, load_bank
 from active6d_agent.evaluation.noise_resampling import join_banks, search_unforeseen
 from active6d_agent.evaluation.policy_evaluation import all_starts, measure, run_named
-from active6d_perception.scene.fusion import RANKINGS, FusionParameters
+from active6d_perception.scene.fusion_parameters import RANKINGS, FusionParameters
 from active6d_tools import bank_building
 from active6d_tools.cli import app
 from active6d_tools.cli.options import LEARNED
@@ -30,7 +30,7 @@ def test_table_1_is_the_policies_episodes(banks, tmp_path):
     assert result.exit_code == 0, result.stderr
     measured = json.loads(file.read_text())
     assert (measured["object"], measured["steps"], measured["episodes"]) == ("mug", 2, 9)
-    lookup = BatchedFusion(load_bank(bank_path(banks, "mug", "test")))
+    lookup = BestViewLookup(load_bank(bank_path(banks, "mug", "test")))
     starts = all_starts(lookup, 9, 3)
     for name in names.split(","):
         row, expected = measured["policies"][name], run_named(lookup, name, starts, 2, seed=3)
@@ -187,7 +187,7 @@ def untrained(tmp_path_factory):
 def expected_rates(banks, folder, part) -> list[float]:
     """Mean detection rates of an ablation with 6 starts of 2 moves, from single calls of the evaluation."""
     bank = load_bank(bank_path(banks, "mug", "test"))
-    own, other = BatchedFusion(bank), BatchedFusion(load_bank(bank_path(banks, "mug", "test", 1)))
+    own, other = BestViewLookup(bank), BestViewLookup(load_bank(bank_path(banks, "mug", "test", 1)))
     starts = all_starts(own, 6, 0)
     scene, views = starts[:, 0], run_named(own, "random", starts, 2).views
 
@@ -203,10 +203,10 @@ def expected_rates(banks, folder, part) -> list[float]:
         return [run_named(own, "random", starts, budget).detection_rate.mean() for budget in (0, 2)]
     if part == "fusion":
         alone = FusionParameters(exclusion=0.0)
-        fusions = [own, BatchedFusion(bank, alone), BatchedFusion(bank, replace(alone, cut=1e-9))]
+        fusions = [own, BestViewLookup(bank, alone), BestViewLookup(bank, replace(alone, cut=1e-9))]
         return [rate(fusion, views) for fusion in fusions]
     if part == "verification":
-        return [rate(BatchedFusion(bank, FusionParameters(rank_by=each)), views) for each in RANKINGS]
+        return [rate(BestViewLookup(bank, FusionParameters(rank_by=each)), views) for each in RANKINGS]
     if part == "attention":
         return trained("learned_alpha0.3", "lowest-score_alpha0.3")
     if part == "signs":
@@ -312,7 +312,7 @@ def test_missing_seeds_are_trained(banks, tmp_path, monkeypatch):
         own = folder / "attention" / f"seed{seed}"
         own.mkdir(parents=True)
         (own / "curve.jsonl").write_text(json.dumps({"steps": 50_000}) + "\n" + json.dumps({"steps": steps}) + "\n")
-    validation = BatchedFusion(load_bank(bank_path(banks, "mug", "val")))
+    validation = BestViewLookup(load_bank(bank_path(banks, "mug", "val")))
     found = ablate._train_seeds(LEARNED, 3, validation, folder, 5, banks)
     assert found["attention", 1] == there
     every = [folder / name / f"seed{seed}" for name in ("view-attention", "attention") for seed in range(3)]
@@ -339,7 +339,7 @@ def test_the_papers_policy_is_trained_in_full_and_begun_trainings_go_on(banks, t
     begun = tmp_path / "mug" / "attention-paper" / "seed1"
     begun.mkdir(parents=True)
     (begun / "latest.json").write_text("{}")
-    validation = BatchedFusion(load_bank(bank_path(banks, "mug", "val")))
+    validation = BestViewLookup(load_bank(bank_path(banks, "mug", "val")))
     found = ablate._train_seeds(("attention-paper",), 3, validation, tmp_path / "mug", 5, banks)
     assert [(name, resume) for name, _, resume in asked] == [("seed0", False), ("seed1", True), ("seed2", False)]
     for _, parameters, _ in asked:

@@ -158,10 +158,10 @@ def test_the_pipelines_rates_are_its_times(prepared, tmp_path, monkeypatch):
 
 def test_every_repeat_sees_the_same_views(prepared, tmp_path):
     """The command, end to end, on prepared views; fusion makes of them what it makes of them once."""
-    from active6d_perception.scene.joint_fusion import JointFusion
+    from active6d_perception.scene.all_views_fusion import AllViewsFusion
     from active6d_perception.scene.verification import Verifier
 
-    verifier, fusion = Verifier(prepared.model), JointFusion(prepared.model)
+    verifier, fusion = Verifier(prepared.model), AllViewsFusion(prepared.model)
     for view in prepared.views:
         found = prepared.hypotheses[view.stamp]
         verification = verifier.score(view.depth, view.camera, found)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hand_made_scenes import make_scene, three_mugs
 
-from active6d_agent.bank.joint_lookup import JointLookup
+from active6d_agent.bank.all_views_lookup import AllViewsLookup
 from active6d_agent.bank.scene_bank import find_bank, load_bank
 from active6d_core.metrics import DETECTION_FRACTION, e_add
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.belief_weights import BeliefWeights, belief_path, load_belief
-from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_tools import fusion_training
 from active6d_tools.fusion_training import count_scenes, describe_scene, fit_fusion, label_scene, refit_probability
@@ -76,7 +76,7 @@ def test_weights_are_fitted_to_scenes(scene_folder, monkeypatch):
     assert (weights.provenance["belief_scenes"], weights.provenance["probability_scenes"]) == (1, 2)
     episodes = fusion_training._episodes("mug/val/0", weights, 1, "auto", 7)
     fusion, last, T_true = next(episodes)
-    assert isinstance(fusion, JointFusion)
+    assert isinstance(fusion, AllViewsFusion)
     objects = fusion.objects(last.stamp, last.T_world_camera, last.camera)
     model = load_object("mug")
     errors = e_add(model, objects.T_world_object[:, None], T_true).min(axis=0)
@@ -96,7 +96,7 @@ def test_only_the_probability_is_fitted_to_banks(bunny_bank, monkeypatch):
     fitted, measured = refit_probability(weights, [bunny_bank], episodes=4, seed=5)
     assert fitted.rotation is weights.rotation
     assert fitted.body is weights.body
-    lookup, model, rows, right = JointLookup(bunny_bank, weights=weights), load_object("bunny"), [], []
+    lookup, model, rows, right = AllViewsLookup(bunny_bank, weights=weights), load_object("bunny"), [], []
     for index, scene in enumerate(bunny_bank.scenes):
         rng = np.random.default_rng([5, index])
         for count in (3, 1, 3, 1):

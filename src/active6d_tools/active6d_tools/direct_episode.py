@@ -13,8 +13,7 @@ from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.object_model import ObjectModel
 from active6d_core.registry import AUTOMATIC
 from active6d_perception.estimators.registry import create_estimator
-from active6d_perception.scene.fusion import SceneFusion
-from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.observed_surface import ObservedSurface
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.simulator import GoalError
@@ -95,12 +94,12 @@ class DirectRunner:
     Args:
         model: of the object.
         limits: of every episode.
-        fusion: of all views in the object's usual bin, as the graph's, when None.
+        fusion: in the object's usual bin, as the graph's, when None.
     """
 
-    def __init__(self, model: ObjectModel, limits: Limits, fusion: JointFusion | SceneFusion | None = None) -> None:
+    def __init__(self, model: ObjectModel, limits: Limits, fusion: AllViewsFusion | None = None) -> None:
         self.limits, self._surface = limits, ObservedSurface(model)
-        self._fusion = JointFusion(model) if fusion is None else fusion
+        self._fusion = AllViewsFusion(model) if fusion is None else fusion
 
     def run(self, policy: Policy, camera: DirectCamera, rng: np.random.Generator) -> DirectEpisode:
         """Run one episode to its end; ``rng`` is the policy's."""

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from active6d_agent.bank.joint_lookup import JointLookup
+from active6d_agent.bank.all_views_lookup import AllViewsLookup
 from active6d_agent.bank.scene_bank import SceneBank
 from active6d_core.interrupts import worker_pool
 from active6d_core.metrics import DETECTION_FRACTION, e_add
 from active6d_core.registry import AUTOMATIC
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.belief_training import LabelledPlaces, fit_belief, fit_probability, label_places
 from active6d_perception.scene.belief_weights import BeliefWeights
-from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_sim.scenes.scene_store import scene_path, stored_names
 from active6d_tools.processed_scene import ProcessedScene, ProcessedView, add_view
 
@@ -92,7 +92,7 @@ def refit_probability(
     """
     rows, right, names = [], [], []
     for bank in banks:
-        lookup = JointLookup(bank, weights=weights)
+        lookup = AllViewsLookup(bank, weights=weights)
         for index, scene in enumerate(bank.scenes):
             if scene.name.split("/")[1] == BELIEF_SPLIT:
                 continue
@@ -156,11 +156,11 @@ def describe_scene(name: str, *, weights: BeliefWeights, episodes: int, estimato
 
 def _episodes(
     name: str, weights: BeliefWeights, episodes: int, estimator: str, seed: int
-) -> Iterator[tuple[JointFusion, ProcessedView, np.ndarray]]:
+) -> Iterator[tuple[AllViewsFusion, ProcessedView, np.ndarray]]:
     """Fusion after each episode's views, its last view, and the true poses."""
     processed = ProcessedScene(name, estimator, seed=seed)
     # The poses of the simulated camera are right.
-    fusion = JointFusion(processed.model, weights=weights, align=False)
+    fusion = AllViewsFusion(processed.model, weights=weights, align=False)
     rng = np.random.default_rng([seed, int(name.split("/")[-1])])
     for episode in range(episodes):
         fusion.reset()

@@ -11,8 +11,8 @@ from active6d_core.registry import AUTOMATIC
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator
 from active6d_perception.model.ambiguity import ambiguity_of
-from active6d_perception.scene.fusion import SceneFusion
-from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
+from active6d_perception.scene.best_view_fusion import BestViewFusion
 from active6d_perception.scene.measured_view import MeasuredView, measure_view, move_view
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.pose_error import PoseError
@@ -102,10 +102,10 @@ class ProcessedScene:
         return self._views[index]
 
 
-def add_view(fusion: JointFusion | SceneFusion, view: ProcessedView) -> None:
+def add_view(fusion: AllViewsFusion | BestViewFusion, view: ProcessedView) -> None:
     """Add a view to a fusion of either kind."""
     known = view.stamp, view.T_world_camera, view.hypotheses, view.verification
-    if isinstance(fusion, JointFusion):
+    if isinstance(fusion, AllViewsFusion):
         fusion.add_measured(*known, view.measured)
     else:
         fusion.add_view(*known)

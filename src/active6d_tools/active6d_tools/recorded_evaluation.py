@@ -19,9 +19,9 @@ from active6d_core.registry import AUTOMATIC
 from active6d_core.se3 import invert
 from active6d_perception.active6d import check_span
 from active6d_perception.model.ambiguity import ambiguity_of
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.camera_alignment import CameraAlignment
 from active6d_perception.scene.expected_visibility import OPEN_TABLE
-from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.measured_view import measure_view
 from active6d_sim.datasets.bop import CAMERA_FILE, TRUTH_FILE, BopScene
 from active6d_sim.datasets.bop_models import differs_from_data_set
@@ -83,7 +83,7 @@ class RecordedEvaluation:
     ) -> None:
         self._model, self._steps, self._seed = model, steps, seed
         # A recording tells where its floor is, but not whether there are walls.
-        self._fusion = JointFusion(model, tray=OPEN_TABLE)
+        self._fusion = AllViewsFusion(model, tray=OPEN_TABLE)
         perception = Perception(model, estimator)
         self.scenes: list[RecordedScene] = []
         #: BOP's number of the object.

@@ -1,4 +1,4 @@
-"""The belief of :class:`.JointFusion` on tabulated evidence, compiled: one call fuses the views of one episode.
+"""The belief of :class:`.AllViewsFusion` on tabulated evidence, compiled: one call fuses the views of one episode.
 
 The columns are those of :mod:`active6d_perception.scene.scene_evidence` and
 :mod:`active6d_perception.scene.object_probability`; a test compares them.
@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from active6d_perception.compiled import compiled
+from active6d_perception.scene.all_views_fusion import HOPELESS
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer
 from active6d_perception.scene.feasibility import FREE
-from active6d_perception.scene.joint_fusion import HOPELESS
 from active6d_perception.scene.measured_cases import (
     CASES,
     FACING_ELSEWHERE,

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from active6d_agent.bank.all_views_lookup import AllViewsLookup, evidence_of
 from active6d_agent.bank.belief_kernel import SceneIndex
-from active6d_agent.bank.joint_lookup import JointLookup, evidence_of
 from active6d_agent.bank.scene_bank import BankScene, SceneBank
 
 _EPISODES = 600
@@ -35,7 +35,7 @@ def prune_candidates(bank: SceneBank, rng: np.random.Generator) -> SceneBank:
     """
     if all(evidence_of(scene).T_world_object.shape[1] == 1 for scene in bank.scenes):
         return bank
-    lookup = JointLookup(bank)
+    lookup = AllViewsLookup(bank)
     best = _highest_probabilities(lookup, rng)
     scenes = [
         _kept(scene, index, probability)
@@ -44,7 +44,7 @@ def prune_candidates(bank: SceneBank, rng: np.random.Generator) -> SceneBank:
     return replace(bank, scenes=scenes)
 
 
-def _highest_probabilities(lookup: JointLookup, rng: np.random.Generator) -> list[np.ndarray]:
+def _highest_probabilities(lookup: AllViewsLookup, rng: np.random.Generator) -> list[np.ndarray]:
     """(K,) highest probability of each candidate of each scene in random episodes."""
     every, views = np.arange(len(lookup.scenes)), len(lookup.sphere)
     rotations = [index.telling.shape[2] for index in lookup.scenes]

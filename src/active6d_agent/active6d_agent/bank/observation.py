@@ -20,9 +20,9 @@ from active6d_core.se3 import quaternion_from_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import Estimator
 from active6d_perception.model.ambiguity import Ambiguity
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.belief_weights import BeliefWeights
 from active6d_perception.scene.evidence_tables import tabulate
-from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.measured_view import MeasuredView, measure_view
 from active6d_perception.scene.observed_surface import SurfaceGrid
 from active6d_perception.scene.verification import Verifier
@@ -142,7 +142,7 @@ def observe_scene(
         views: folder in which each view is kept, so that only missing ones are observed; None keeps nothing.
     """
     observed = []
-    fusion = JointFusion(model, weights=BeliefWeights.indifferent(), align=False)
+    fusion = AllViewsFusion(model, weights=BeliefWeights.indifferent(), align=False)
     for index, position in enumerate(sphere.positions):
         T_world_camera, stamp = sphere.pose(position), (index + 1) * 1_000_000_000
         file = None if views is None else views / f"{index}.npz"

@@ -14,7 +14,8 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.metrics import MISSED_E_ADD, SceneScore, score_errors
 from active6d_core.se3 import invert
 from active6d_perception.model.model_views import model_views
-from active6d_perception.scene.fusion import FusionParameters, project_features
+from active6d_perception.scene.fusion_parameters import FusionParameters
+from active6d_perception.scene.object_features import project_features
 from active6d_perception.scene.observed_surface import explainer
 
 

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from active6d_agent.bank.joint_lookup import make_lookup
+from active6d_agent.bank.all_views_lookup import make_lookup
 from active6d_agent.bank.scene_bank import SceneBank, load_bank
 from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.episodes import Episodes

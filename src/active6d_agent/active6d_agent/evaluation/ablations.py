@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.bank.scene_bank import SceneBank
 from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.episodes import RewardParameters
@@ -19,7 +19,7 @@ from active6d_agent.evaluation.policy_evaluation import Intervals, describe, run
 from active6d_agent.policies.attention.network import ATTENTION_RULES
 from active6d_agent.policies.attention.ppo import PpoParameters, train_ppo
 from active6d_core.metrics import score_errors
-from active6d_perception.scene.fusion import RANKINGS, FusionParameters
+from active6d_perception.scene.fusion_parameters import RANKINGS, FusionParameters
 
 ALPHAS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
 #: T of the paper's figure, from the single shot to all views.
@@ -108,17 +108,17 @@ def ablate_fusion(
         seed: of the policy's randomness.
         scores: compare what hypotheses are ranked by (``rank_by``); otherwise clustering with none.
     """
-    deployed = BatchedFusion(bank)
+    deployed = BestViewLookup(bank)
     views = run_named(deployed, policy, starts, steps, seed=seed).views
     if scores:
-        variants = tuple((each, BatchedFusion(bank, FusionParameters(rank_by=each))) for each in RANKINGS)
+        variants = tuple((each, BestViewLookup(bank, FusionParameters(rank_by=each))) for each in RANKINGS)
     else:
         alone = FusionParameters(cut=deployed.parameters.cut, exclusion=0.0)
         separate = FusionParameters(cut=1e-9, exclusion=0.0)
         variants = (
             ("clustering and exclusion", deployed),
-            ("clustering alone", BatchedFusion(bank, alone)),
-            ("no clustering", BatchedFusion(bank, separate)),
+            ("clustering alone", BestViewLookup(bank, alone)),
+            ("no clustering", BestViewLookup(bank, separate)),
         )
     intervals, first = Intervals(starts[:, 0], seed), None
     for name, lookup in variants:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.bank.scene_bank import SceneBank
 from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.rollout import measure
@@ -110,7 +110,7 @@ def join_banks(bank: SceneBank, other: SceneBank) -> SceneLookup:
         )
         for first, second in zip(bank.scenes, other.scenes, strict=True)
     ]
-    return BatchedFusion(replace(bank, sphere=twice, scenes=scenes))
+    return BestViewLookup(replace(bank, sphere=twice, scenes=scenes))
 
 
 def search_unforeseen(joined: SceneLookup, starts: np.ndarray, steps: int) -> np.ndarray:

@@ -12,7 +12,8 @@ from active6d_core.metrics import DETECTION_FRACTION, add_s, e_add, evaluate_sce
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, rotation_angle
 from active6d_perception.estimators.registry import Estimator
-from active6d_perception.scene.fusion import FusionParameters, SceneFusion
+from active6d_perception.scene.best_view_fusion import BestViewFusion
+from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_perception.scene.verification import Verifier
 
 #: A hypothesis and a true object are compared if their origins are closer than this, in diameters...
@@ -219,7 +220,7 @@ def detection_over_views(
     verifier = Verifier(model)
     rates: list[list[float]] = []
     for episode in episodes:
-        fusion = SceneFusion(model, parameters)
+        fusion = BestViewFusion(model, parameters)
         rates.append([])
         for labelled in episode:
             view = labelled.view

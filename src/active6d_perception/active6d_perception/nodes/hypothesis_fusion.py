@@ -33,10 +33,11 @@ from active6d_core.ros.optional_outputs import DetectionOutput
 from active6d_core.ros.runner import run_node
 from active6d_core.ros.view_inputs import ViewInputs
 from active6d_core.se3 import invert, transform_points
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
+from active6d_perception.scene.best_view_fusion import BestViewFusion
 from active6d_perception.scene.camera_alignment import CameraAlignment
 from active6d_perception.scene.expected_visibility import Tray
-from active6d_perception.scene.fusion import METHODS, RANKINGS, FusionParameters, SceneFusion
-from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.fusion_parameters import METHODS, RANKINGS, FusionParameters
 from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
 from active6d_perception.scene.verification import Verifier
 
@@ -173,7 +174,7 @@ class HypothesisFusionNode(GraphNode):
         parameters = FusionParameters(**{each.name: self.value(each.name) for each in fields(FusionParameters)})
         self._verifier = Verifier(self._model, self.value("epsilon"), self.value("samples"))
         self._settings, self._fusion = parameters, self._make_fusion(parameters)
-        self._cameras = self._fusion.cameras if isinstance(self._fusion, JointFusion) else CameraAlignment()
+        self._cameras = self._fusion.cameras if isinstance(self._fusion, AllViewsFusion) else CameraAlignment()
         self._surface = ObservedSurface(self._model, self._make_grid(), parameters.explained_within)
         self._mesh_uri = ""
         try:
@@ -181,14 +182,14 @@ class HypothesisFusionNode(GraphNode):
         except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
             self.get_logger().warning(f"objects/markers stays empty, the mesh cannot be written for viewers: {error}")
 
-    def _make_fusion(self, parameters: FusionParameters) -> SceneFusion | JointFusion:
+    def _make_fusion(self, parameters: FusionParameters) -> BestViewFusion | AllViewsFusion:
         if self.value("method") == "best-view":
-            return SceneFusion(self._model, parameters)
+            return BestViewFusion(self._model, parameters)
         usual, height = Tray.for_model(self._model), self.value("wall_height")
         width = self.value("bin_width") or usual.width
         tray = Tray(width, self.value("bin_depth") or width, usual.wall_height if height < 0 else height)
         walled = self.value("bin_width") > 0
-        return JointFusion(self._model, parameters, tray=tray, walled=walled, align=self.value("align_views"))
+        return AllViewsFusion(self._model, parameters, tray=tray, walled=walled, align=self.value("align_views"))
 
     def _make_grid(self) -> SurfaceGrid:
         usual = SurfaceGrid.for_model(self._model)
@@ -243,12 +244,12 @@ class HypothesisFusionNode(GraphNode):
             summary.append(f"{len(hypotheses)} hypotheses, {len(objects)} objects, {confirmed} of them confirmed")
             if aligned.shift:
                 summary.append(f"the camera's pose was corrected by {1e3 * aligned.shift:.1f} mm at the scene")
-            if isinstance(self._fusion, JointFusion):
+            if isinstance(self._fusion, AllViewsFusion):
                 self._report_container(self._fusion, len(objects))
             if not aligned.aligned:
                 summary.append("the depth image could not be aligned with the others, the camera's pose is as given")
 
-    def _report_container(self, fusion: JointFusion, count: int) -> None:
+    def _report_container(self, fusion: AllViewsFusion, count: int) -> None:
         """Say what is probably wrong where many objects are outside of the container."""
         if fusion.in_walls:
             self.say_once(

@@ -1,15 +1,15 @@
 """Evidence of every view on fixed candidates of a scene, so that fusing any of its views is a look-up.
 
-:class:`.JointFusion` refines its candidates with the views that it has. A table needs candidates that do not depend on
-the choice of views: those of all views of the scene. What each view measured at each of them is stored.
+:class:`.AllViewsFusion` refines its candidates with the views that it has. A table needs candidates that do not depend
+on the choice of views: those of all views of the scene. What each view measured at each of them is stored.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from active6d_perception.scene.all_views_fusion import OWN_PLACE, WHOLE_GATES, AllViewsFusion, scaled_gates
 from active6d_perception.scene.body_refinement import refine_poses
-from active6d_perception.scene.joint_fusion import OWN_PLACE, WHOLE_GATES, JointFusion, scaled_gates
 from active6d_perception.scene.measured_cases import CASES, count_cases
 
 # Whole objects are refined with about as many views: an episode has few, and there are many poses.
@@ -69,7 +69,7 @@ class EvidenceTables:
         )
 
 
-def tabulate(fusion: JointFusion) -> EvidenceTables:
+def tabulate(fusion: AllViewsFusion) -> EvidenceTables:
     """The tables of all views of ``fusion``, in the order of their stamps."""
     ambiguity, candidates = fusion.ambiguity, fusion.candidates()
     gathered = np.bincount(candidates.place, candidates.evidence)

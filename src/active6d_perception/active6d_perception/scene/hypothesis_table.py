@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from active6d_core.hypotheses import Hypotheses
+from active6d_perception.scene.fusion_parameters import FusionParameters
 
 #: (n, 4, 4) and (m, 4, 4) poses in one frame to their (n, m) distances in metres.
 Distance = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -90,3 +91,28 @@ class HypothesisTable:
             worth = confidence(self.table[:, 0], self.table[:, 1])
             self._keep(np.sort(np.argsort(-worth, kind="stable")[:MOST_HYPOTHESES]))
         return True
+
+
+def evidence(verification: np.ndarray, score: np.ndarray, parameters: FusionParameters) -> np.ndarray | None:
+    """(k,) evidence of each hypothesis for its cluster; None if clusters are ranked by their best hypothesis."""
+    return confidence(verification, score) ** 2 if parameters.rank_by == "evidence" else None
+
+
+def preference(
+    verification: np.ndarray, score: np.ndarray, T_world_object: np.ndarray, parameters: FusionParameters
+) -> np.ndarray:
+    """Order hypotheses by preference, and leave out those that are verified too badly.
+
+    Args:
+        verification: (k,) verification scores (equation 1).
+        score: (k,) scores of the estimator.
+        T_world_object: (k, 4, 4) poses in the world, metres.
+        parameters: how to rank and what to leave out.
+
+    Returns:
+        (h,) indices, best first. Equal hypotheses are ordered by pose, so that the order of views does not matter.
+    """
+    worth = {"verification": verification, "score": score}.get(parameters.rank_by, confidence(verification, score))
+    entries = T_world_object[:, :3].reshape(len(verification), 12)
+    order = np.lexsort([*entries.T, -worth])
+    return order[verification[order] >= parameters.min_verification]

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from active6d_core.registry import AUTOMATIC
-from active6d_perception.scene.fusion import FusionParameters
-from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
+from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_sim.rendering.pose_error import PoseError
 from active6d_tools.benchmark.fusion_methods import KINDS, MethodResults, draw_episodes, fuse_episode
 from active6d_tools.processed_scene import ProcessedScene, disturb
@@ -66,8 +66,8 @@ def measure_errors(
         on_progress(name, done, len(names))
         processed, index = ProcessedScene(name, estimator, seed=seed), int(name.split("/")[-1])
         variants = {
-            ALIGNED: JointFusion(processed.model, parameters),
-            NOT_ALIGNED: JointFusion(processed.model, parameters, align=False),
+            ALIGNED: AllViewsFusion(processed.model, parameters),
+            NOT_ALIGNED: AllViewsFusion(processed.model, parameters, align=False),
         }
         drawn = list(draw_episodes(processed, KINDS[:2], episodes, np.random.default_rng([seed + 1, index])))
         for error in errors:

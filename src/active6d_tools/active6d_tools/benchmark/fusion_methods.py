@@ -9,8 +9,9 @@ import numpy as np
 from active6d_core.metrics import DETECTION_FRACTION, MISSED_E_ADD, e_add, score_errors
 from active6d_core.registry import AUTOMATIC
 from active6d_perception.estimators.detection_rates import area_under_curve, calibration_error
-from active6d_perception.scene.fusion import FusionParameters, SceneFusion
-from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
+from active6d_perception.scene.best_view_fusion import BestViewFusion
+from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_tools.processed_scene import RING_VIEWS, ProcessedScene, ProcessedView, add_view
 
 #: The views of an episode: six evenly on a ring at 45 degrees, six at random, or all of the grid.
@@ -95,9 +96,9 @@ def compare_methods(
     for done, name in enumerate(names):
         on_progress(name, done, len(names))
         processed = ProcessedScene(name, estimator, seed=seed, vary_shapes=vary_shapes)
-        methods: dict[str, SceneFusion | JointFusion] = {
-            "best-view": SceneFusion(processed.model, parameters),
-            "all-views": JointFusion(processed.model, parameters),
+        methods: dict[str, BestViewFusion | AllViewsFusion] = {
+            "best-view": BestViewFusion(processed.model, parameters),
+            "all-views": AllViewsFusion(processed.model, parameters),
         }
         rng = np.random.default_rng([seed + 1, int(name.split("/")[-1])])
         for kind, views in draw_episodes(processed, kinds, episodes, rng):
@@ -123,7 +124,7 @@ def draw_episodes(
 
 
 def fuse_episode(
-    fusion: JointFusion | SceneFusion,
+    fusion: AllViewsFusion | BestViewFusion,
     views: Sequence[ProcessedView],
     result: MethodResults,
     processed: ProcessedScene,

@@ -208,11 +208,15 @@ def _summary(times: dict[str, list[np.ndarray]]) -> dict[str, float]:
 def _direct(prepared: PreparedViews) -> tuple[np.ndarray, np.ndarray]:
     """Seconds per view of the core functions, and the part of verification and fusion."""
     from active6d_agent.policies.registry import Observation, create_policy
-    from active6d_perception.scene.joint_fusion import JointFusion
+    from active6d_perception.scene.all_views_fusion import AllViewsFusion
     from active6d_perception.scene.observed_surface import ObservedSurface
     from active6d_perception.scene.verification import Verifier
 
-    verifier, fusion, surface = Verifier(prepared.model), JointFusion(prepared.model), ObservedSurface(prepared.model)
+    verifier, fusion, surface = (
+        Verifier(prepared.model),
+        AllViewsFusion(prepared.model),
+        ObservedSurface(prepared.model),
+    )
     policy, sphere = create_policy("lowest-score", prepared.model), ViewSphere()
     policy.reset(np.random.default_rng(0))
     allowed, positions = np.ones(len(sphere), bool), []

@@ -18,7 +18,7 @@ from active6d_agent.policies.view_attention.network import ViewAttention, save_n
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import ObjectModel
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.scene.joint_fusion import JointFusion
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.observed_surface import ObservedSurface
 from active6d_perception.scene.verification import Verifier
 from active6d_tools.benchmark.graph_overhead import PreparedViews, disturbances, prepare_views
@@ -120,7 +120,7 @@ def time_last_view(
 ) -> LastViewTimes:
     """Verify, fuse and decide on the last view ``repeats`` times; the earlier views are fused before."""
     model, sphere = prepared.model, ViewSphere()
-    fusion, surface = JointFusion(model), ObservedSurface(model)
+    fusion, surface = AllViewsFusion(model), ObservedSurface(model)
     *earlier, (last, hypotheses) = zip(prepared.views, found, strict=True)
     known = [(view, one, verifier.score(view.depth, view.camera, one)) for view, one in earlier]
     positions = np.array([view.T_world_camera[:3, 3] for view in prepared.views])

@@ -82,8 +82,8 @@ def ablate(
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """
-    from active6d_agent.bank.batched_fusion import BatchedFusion
-    from active6d_agent.bank.joint_lookup import make_lookup
+    from active6d_agent.bank.all_views_lookup import make_lookup
+    from active6d_agent.bank.best_view_lookup import BestViewLookup
     from active6d_agent.bank.scene_bank import load_bank
     from active6d_agent.evaluation.policy_evaluation import all_starts
     from active6d_tools.report.ablation_plots import ablation_panels
@@ -93,7 +93,7 @@ def ablate(
     parameters = parse_overrides(override or [])
     with messages.status("reading the banks"):
         # Candidates of all views cannot be joined from two banks of one scene.
-        make = BatchedFusion if part is Part.NOISE_RESAMPLING else make_lookup
+        make = BestViewLookup if part is Part.NOISE_RESAMPLING else make_lookup
         lookups = {split: make(load_bank(path)) for split, path in paths.items()}
     starts = all_starts(lookups["test"], sample, seed)
     names = [name.strip() for name in policies.split(",")]
@@ -203,7 +203,7 @@ def _train_seeds(
     policies: Sequence[str], seeds: int, validation: "SceneLookup", folder: Path, steps: int, banks: Path | None
 ) -> dict[tuple[str, int], Path]:
     """Weights of every policy and seed; missing ones are trained as by ``active6d train policy``, begun ones go on."""
-    from active6d_agent.bank.joint_lookup import make_lookup
+    from active6d_agent.bank.all_views_lookup import make_lookup
     from active6d_agent.bank.scene_bank import find_bank, load_bank
     from active6d_tools.policy_training import plan_training
 

@@ -34,7 +34,7 @@ def camera_errors(
 
     Example: [bold]active6d benchmark camera-errors --object mug --scenes 2 --errors 0/0,5/0.5 --png errors.png[/bold]
     """
-    from active6d_perception.scene.fusion import FusionParameters
+    from active6d_perception.scene.fusion_parameters import FusionParameters
     from active6d_tools.bank_building import scene_names
     from active6d_tools.benchmark.camera_errors import error_panels, measure_errors, parse_errors
     from active6d_tools.report.line_plots import draw_panels

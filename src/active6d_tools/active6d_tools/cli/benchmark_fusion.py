@@ -46,7 +46,7 @@ def fusion(
 
     Example: [bold]active6d benchmark fusion --object mug --scenes 2 --json fusion.json[/bold]
     """
-    from active6d_perception.scene.fusion import FusionParameters
+    from active6d_perception.scene.fusion_parameters import FusionParameters
     from active6d_tools.bank_building import scene_names
     from active6d_tools.benchmark.fusion_methods import KINDS, compare_methods
 

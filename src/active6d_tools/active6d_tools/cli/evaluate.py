@@ -76,7 +76,7 @@ def _evaluate_bank(
     seed: int,
     json_file: Path | None,
 ) -> None:
-    from active6d_agent.bank.joint_lookup import make_lookup
+    from active6d_agent.bank.all_views_lookup import make_lookup
     from active6d_agent.bank.scene_bank import find_bank, load_bank
     from active6d_agent.evaluation.policy_evaluation import all_starts, summarise
     from active6d_agent.evaluation.policy_evaluation import evaluate as run_all

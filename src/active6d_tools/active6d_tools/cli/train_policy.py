@@ -47,7 +47,7 @@ def policy(
 
     Example: [bold]active6d train policy --object mug --policy view-attention --export weights[/bold]
     """
-    from active6d_agent.bank.joint_lookup import make_lookup
+    from active6d_agent.bank.all_views_lookup import make_lookup
     from active6d_agent.bank.scene_bank import find_bank, load_bank
     from active6d_core.files import cache_folder
     from active6d_tools.policy_training import plan_training

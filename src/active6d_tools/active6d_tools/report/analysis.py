@@ -10,7 +10,7 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.metrics import DETECTION_FRACTION, SceneScore, evaluate_scene
 from active6d_core.object_model import ObjectModel, list_objects, load_object
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.scene.fusion import FusionParameters
+from active6d_perception.scene.fusion_parameters import FusionParameters
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from active6d_core.metrics import evaluate_scene
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator
-from active6d_perception.scene.fusion import RANKINGS, FusionParameters, SceneFusion
+from active6d_perception.scene.best_view_fusion import BestViewFusion
+from active6d_perception.scene.fusion_parameters import RANKINGS, FusionParameters
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import SPLITS, load_scene
@@ -43,7 +44,7 @@ def main() -> None:
             seen.append((stamp, T_world_camera, found, verifier.score(captured.depth, captured.camera, found)))
         for walk in (seen[start : start + arguments.views] for start in range(0, len(seen), arguments.views)):
             for ranking in RANKINGS:
-                fusion = SceneFusion(model, FusionParameters(rank_by=ranking))
+                fusion = BestViewFusion(model, FusionParameters(rank_by=ranking))
                 for taken in walk:
                     fusion.add_view(*taken)
                 objects = fusion.objects(*walk[-1][:2], DEFAULT_CAMERA)

@@ -8,7 +8,7 @@ Example: python -m active6d_tools.studies.compare_visibility mug
 
 import numpy as np
 
-from active6d_agent.bank.joint_lookup import make_lookup
+from active6d_agent.bank.all_views_lookup import make_lookup
 from active6d_agent.bank.scene_bank import find_bank, load_bank
 from active6d_agent.environment.rollout import observe
 from active6d_agent.evaluation.oracle import known

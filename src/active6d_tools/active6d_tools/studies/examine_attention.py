@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from active6d_agent.bank.joint_lookup import make_lookup
+from active6d_agent.bank.all_views_lookup import make_lookup
 from active6d_agent.bank.scene_bank import find_bank, load_bank
 from active6d_agent.bank.scene_lookup import SceneLookup
 from active6d_agent.environment.episodes import Episodes

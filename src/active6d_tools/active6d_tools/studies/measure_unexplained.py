@@ -6,10 +6,10 @@ Example: python -m active6d_tools.studies.measure_unexplained mug --within 0.05
 
 import numpy as np
 
-from active6d_agent.bank.joint_lookup import make_lookup
+from active6d_agent.bank.all_views_lookup import make_lookup
 from active6d_agent.bank.scene_bank import find_bank, load_bank
 from active6d_core.metrics import DETECTION_FRACTION
-from active6d_perception.scene.fusion import FusionParameters
+from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_perception.scene.observed_surface import explainer
 from active6d_sim.scenes.scene_store import find_scene
 from active6d_tools.studies.arguments import study_parser

@@ -1,7 +1,7 @@
 """The paper's fusion, by the best view, on the scenes of a bank, for many episodes at once.
 
 Values that do not depend on the chosen views are computed once: distances between hypotheses, their components,
-and their boxes in every view. :class:`~active6d_perception.scene.fusion.SceneFusion` calls the same
+and their boxes in every view. :class:`.BestViewFusion` calls the same
 :mod:`active6d_perception.scene.clustering`, so results are equal for the same views. The surface that a hypothesis
 explains is computed at the first request and kept, see :mod:`active6d_perception.scene.observed_surface`.
 """
@@ -18,7 +18,8 @@ from active6d_agent.bank.scene_lookup import FusedBatch, SceneLookup
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.scene.clustering import cluster_groups
-from active6d_perception.scene.fusion import FusionParameters, evidence, preference
+from active6d_perception.scene.fusion_parameters import FusionParameters
+from active6d_perception.scene.hypothesis_table import evidence, preference
 from active6d_perception.suppression import suppress_neighbours
 
 _NO_ROW = np.iinfo(np.int64).max
@@ -27,7 +28,7 @@ _SIZES = ((2, 2), (3, 4), (5, 8), (9, 16), (17, 32), (33, 10_000))
 
 
 @dataclass(frozen=True, eq=False)
-class ClusteredBatch(FusedBatch):
+class BestViewBatch(FusedBatch):
     """Accumulated objects that are clusters of hypotheses; their poses are those of hypotheses.
 
     Attributes:
@@ -41,7 +42,7 @@ class ClusteredBatch(FusedBatch):
     labels: np.ndarray
 
 
-class BatchedFusion(SceneLookup):
+class BestViewLookup(SceneLookup):
     """Fusion by the best view. "Rows" are hypotheses of all scenes, in fusion's order of preference."""
 
     def __init__(
@@ -102,7 +103,7 @@ class BatchedFusion(SceneLookup):
         entry = self._block_start[component] + place[..., :, None] * self._size[component] + place[..., None, :]
         return self._block[entry]
 
-    def fuse(self, scene: np.ndarray, views: np.ndarray, current: np.ndarray) -> ClusteredBatch:
+    def fuse(self, scene: np.ndarray, views: np.ndarray, current: np.ndarray) -> BestViewBatch:
         """Fuse the views of E episodes; see :meth:`.SceneLookup.fuse`."""
         count = len(scene)
         taken = np.where(views[..., None] >= 0, self._rows_of_view[scene[:, None], views], _NO_ROW)
@@ -127,7 +128,7 @@ class BatchedFusion(SceneLookup):
         now = np.flatnonzero(self.view[rows] == current[episode])[::-1]
         seen[labels[now]] = rows[now]
         objects = np.where(kept, rows[table], -1)
-        return ClusteredBatch(
+        return BestViewBatch(
             objects,
             objects,
             np.where(kept, seen[table], -1),
@@ -139,7 +140,7 @@ class BatchedFusion(SceneLookup):
         )
 
     def _support(self, fused: FusedBatch) -> tuple[np.ndarray, np.ndarray]:
-        assert isinstance(fused, ClusteredBatch), "of another look-up"
+        assert isinstance(fused, BestViewBatch), "of another look-up"
         count, M = len(fused.members), len(self.sphere)
         seen_from = np.unique(fused.labels * M + self.view[fused.members]) // M
         support, spread = np.bincount(seen_from, minlength=count), np.zeros(count)

@@ -14,8 +14,10 @@ from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.scene import hypothesis_table
+from active6d_perception.scene.best_view_fusion import BestViewFusion, cluster, select
 from active6d_perception.scene.clustering import cluster_groups
-from active6d_perception.scene.fusion import FusionParameters, SceneFusion, cluster, project_features, select
+from active6d_perception.scene.fusion_parameters import FusionParameters
+from active6d_perception.scene.object_features import project_features
 
 NAMES = ("coffee_cup", "bunny", "mug")
 SPHERE = ViewSphere()
@@ -86,7 +88,7 @@ def make_episode(seed, views=5, objects=6):
 
 
 def fuse(model, views, parameters=None):
-    fusion = SceneFusion(model, parameters)
+    fusion = BestViewFusion(model, parameters)
     for stamp, T_world_camera, hypotheses, verification in views:
         fusion.add_view(stamp, T_world_camera, hypotheses, verification)
     return fusion
@@ -231,7 +233,7 @@ def test_a_large_group_is_clustered_alike():
 
 def test_scattered_hypotheses_without_end_keep_their_cost(monkeypatch):
     monkeypatch.setattr(hypothesis_table, "MOST_HYPOTHESES", 100)
-    fusion, T_world_camera = SceneFusion(load_object("mug")), ViewSphere().pose(ViewSphere().positions[40])
+    fusion, T_world_camera = BestViewFusion(load_object("mug")), ViewSphere().pose(ViewSphere().positions[40])
     rng, best = np.random.default_rng(0), 0.0
     for stamp in range(1, 21):
         T = make_transform(np.tile(np.eye(3), (20, 1, 1)), [0, 0, 0.8] + rng.uniform(-0.15, 0.15, (20, 3)))
@@ -254,4 +256,4 @@ def test_bad_parameters_and_scores_are_named():
     _, episode = make_episode(0)
     stamp, T, hypotheses, verification = episode[0]
     with pytest.raises(ValueError, match="verification scores for"):
-        SceneFusion(load_object("mug")).add_view(stamp, T, hypotheses, verification[:-1])
+        BestViewFusion(load_object("mug")).add_view(stamp, T, hypotheses, verification[:-1])

@@ -7,9 +7,9 @@ import pytest
 from hand_made_scenes import three_mugs
 from scipy.special import expit
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
+from active6d_agent.bank.all_views_lookup import AllViewsLookup, index_scene, make_belief, make_lookup
 from active6d_agent.bank.belief_kernel import fuse_episode
-from active6d_agent.bank.joint_lookup import JointLookup, index_scene, make_belief, make_lookup
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.bank.observation import observe_scene
 from active6d_agent.bank.scene_bank import SceneBank, load_bank
 from active6d_core.camera import DEFAULT_CAMERA
@@ -19,11 +19,11 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.ambiguity import ambiguity_of
+from active6d_perception.scene.all_views_fusion import BESIDE, AllViewsFusion
 from active6d_perception.scene.belief_weights import belief_path, load_belief
 from active6d_perception.scene.body_candidates import BodyCandidates
 from active6d_perception.scene.feasibility import against_container, against_neighbour, combine_neighbours
-from active6d_perception.scene.fusion import FusionParameters
-from active6d_perception.scene.joint_fusion import BESIDE, JointFusion
+from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_perception.scene.object_probability import describe_objects
 from active6d_perception.scene.observed_surface import SurfaceGrid
 from active6d_perception.scene.scene_evidence import BodyEvidence, SceneEvidence
@@ -76,7 +76,7 @@ def bank(simulator, tmp_path_factory):
 
 
 def evidence_of_views(scene, index, views):
-    """What the tables say after these views, as :class:`.JointFusion` has it."""
+    """What the tables say after these views, as :class:`.AllViewsFusion` has it."""
     tables, ambiguity = scene.evidence, ambiguity_of(load_object("mug"))
     rows = np.flatnonzero(np.isin(scene.view, views))
     evidence = np.bincount(index.candidate[rows], index.confidence[rows] ** 2, len(tables.place))
@@ -89,7 +89,7 @@ def evidence_of_views(scene, index, views):
     apart = np.linalg.norm((T @ [*ambiguity.middle, 1])[:, None] - T[heads] @ [*ambiguity.middle, 1], axis=-1)
     own, neighbour = np.nonzero((place[:, None] != place[heads]) & (apart < BESIDE * ambiguity.diameter))
     parts = (np.eye(4)[None], ambiguity.body_points), (ambiguity.rotations, ambiguity.telling_points)
-    tray = JointFusion(load_object("mug"))._tray
+    tray = AllViewsFusion(load_object("mug"))._tray
     container = [against_container(T, *part, tray, 1.0) for part in parts]
     among = [
         combine_neighbours(against_neighbour(T[own], T[heads][neighbour], *part, ambiguity.solid, 1.0), own, len(T))
@@ -106,7 +106,7 @@ def evidence_of_views(scene, index, views):
 def test_the_compiled_belief_is_that_of_the_fusion(bank):
     model, parameters = load_object("mug"), FusionParameters(least_probability=0.0, exclusion=1e-6)
     weights = load_belief(belief_path("mug"))
-    belief, fusion = make_belief(model, weights, parameters), JointFusion(model, weights=weights)
+    belief, fusion = make_belief(model, weights, parameters), AllViewsFusion(model, weights=weights)
     scene = bank.scenes[0]
     index = index_scene(scene, model, SPHERE, belief.cut)
     for views in ([0, 4, 9], [2], [1, 3, 5, 6, 8, 11]):
@@ -139,8 +139,8 @@ def test_the_compiled_belief_is_that_of_the_fusion(bank):
 def test_the_look_up_finds_what_the_node_finds(bank, simulator):
     model, scene = load_object("mug"), simulator.scene
     lookup = make_lookup(bank)
-    assert isinstance(lookup, JointLookup)
-    fusion, verifier, estimator = JointFusion(model), Verifier(model), GuessesHandles(simulator)
+    assert isinstance(lookup, AllViewsLookup)
+    fusion, verifier, estimator = AllViewsFusion(model), Verifier(model), GuessesHandles(simulator)
     views = [0, 3, 6, 9, 10]
     # The estimator guesses again in the order of the bank.
     seen = {}
@@ -165,6 +165,6 @@ def test_the_look_up_finds_what_the_node_finds(bank, simulator):
 
 def test_a_bank_without_evidence_is_fused_by_the_best_view(bank):
     old = replace(bank, scenes=[replace(scene, evidence=None) for scene in bank.scenes])
-    assert isinstance(make_lookup(old), BatchedFusion)
+    assert isinstance(make_lookup(old), BestViewLookup)
     with pytest.raises(ValueError, match="no evidence of all views; make it again"):
-        JointLookup(old)
+        AllViewsLookup(old)

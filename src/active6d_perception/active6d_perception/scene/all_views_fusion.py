@@ -1,6 +1,6 @@
 """Fusion of the depth images of all views: bodies are refined jointly, and a belief resolves ambiguous poses.
 
-:class:`.SceneFusion` keeps the best hypothesis of a single view. This fusion uses hypotheses only as proposals. The
+:class:`.BestViewFusion` keeps the best hypothesis of a single view. This fusion uses hypotheses only as proposals. The
 evidence is what every depth image measured where a candidate has its surface: that surface, something in front of it,
 or something behind it. Poses in which solid objects overlap are improbable.
 
@@ -28,11 +28,12 @@ from active6d_perception.scene.camera_alignment import CameraAlignment
 from active6d_perception.scene.clustering import cluster
 from active6d_perception.scene.expected_visibility import Tray
 from active6d_perception.scene.feasibility import against_container, against_neighbour, combine_neighbours
-from active6d_perception.scene.fusion import FusionParameters, preference, project_features
-from active6d_perception.scene.hypothesis_table import HypothesisTable, confidence
+from active6d_perception.scene.fusion_parameters import FusionParameters
+from active6d_perception.scene.hypothesis_table import HypothesisTable, confidence, preference
 from active6d_perception.scene.measured_cases import CASES, count_cases
 from active6d_perception.scene.measured_view import MeasuredView, measure_view
 from active6d_perception.scene.memo import Memo, ViewSums
+from active6d_perception.scene.object_features import project_features
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS, describe_objects
 from active6d_perception.scene.pose_lattice import round_poses
 from active6d_perception.scene.rotation_belief import PlaceBeliefs, decide, posterior
@@ -74,7 +75,7 @@ class _Part:
 
 
 @dataclass(frozen=True, eq=False)
-class JointObjects:
+class DescribedObjects:
     """Fused objects with what is known of them, best first.
 
     Attributes:
@@ -86,12 +87,12 @@ class JointObjects:
     description: np.ndarray
 
 
-class JointFusion:
+class AllViewsFusion:
     """Accumulates views and computes the objects of the scene from all of them.
 
     Args:
         model: the object.
-        parameters: settings shared with :class:`.SceneFusion`.
+        parameters: settings shared with :class:`.BestViewFusion`.
         weights: of the belief; those of the object when None.
         tray: floor and walls; those of the object's usual bin when None.
         walled: whether the walls are really there; objects that stand in them are withdrawn.
@@ -304,12 +305,12 @@ class JointFusion:
         T = evidence.candidates.T_world_object[beliefs.candidate] @ rotation
         return self._whole.refine(T, self._all_views())
 
-    def describe(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> JointObjects:
+    def describe(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> DescribedObjects:
         """The objects of all views so far with what is known of them; arguments as for :meth:`objects`."""
         self.in_walls = self.below_floor = 0
         order = self._order()
         if not len(order):
-            return JointObjects(SceneObjects.empty(), np.zeros((0, len(OBJECT_COLUMNS))))
+            return DescribedObjects(SceneObjects.empty(), np.zeros((0, len(OBJECT_COLUMNS))))
         evidence = self.evidence()
         beliefs = self.believe(evidence)
         T = self.poses(evidence, beliefs)
@@ -344,7 +345,7 @@ class JointFusion:
             probability[kept],
             beliefs.entropy[kept],
         )
-        return JointObjects(objects, description[kept])
+        return DescribedObjects(objects, description[kept])
 
     def _members(self, T_world_object: np.ndarray, hypotheses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n, h) distances of the bodies of (n, 4, 4) objects from those of (h, 4, 4) hypotheses, metres, and (n, h)
@@ -374,7 +375,7 @@ class JointFusion:
 
     def objects(self, stamp: int, T_world_camera: np.ndarray, camera: PinholeCamera) -> SceneObjects:
         """The objects of all views so far, most probable first; arguments and features as for
-        :meth:`.SceneFusion.objects`."""
+        :meth:`.BestViewFusion.objects`."""
         return self.describe(stamp, T_world_camera, camera).objects
 
 

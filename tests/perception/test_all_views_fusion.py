@@ -13,10 +13,10 @@ from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.ambiguity import ambiguity_of
-from active6d_perception.scene import body_candidates, body_refinement, joint_fusion
+from active6d_perception.scene import all_views_fusion, body_candidates, body_refinement
+from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer
 from active6d_perception.scene.expected_visibility import OPEN_TABLE, Tray
-from active6d_perception.scene.joint_fusion import JointFusion
 from active6d_perception.scene.measured_cases import CASES, FITTING, LOOKED_THROUGH, WHAT, WHOSE
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_perception.scene.scene_evidence import BODY_COLUMNS, ROTATION_COLUMNS
@@ -80,8 +80,8 @@ def _floor_depth(T_world_camera: np.ndarray) -> np.ndarray:
     return -T_world_camera[2, 3] / (rays @ T_world_camera[2, :3])
 
 
-def fuse(mug, views, weights=None) -> JointFusion:
-    fusion = JointFusion(mug, weights=weights or hand_set_weights(), tray=OPEN_TABLE)
+def fuse(mug, views, weights=None) -> AllViewsFusion:
+    fusion = AllViewsFusion(mug, weights=weights or hand_set_weights(), tray=OPEN_TABLE)
     for view in views:
         fusion.add_view(*view)
     return fusion
@@ -116,7 +116,7 @@ def test_an_object_of_another_size_is_judged_like_one_of_usual_size(mug, episode
 def test_what_stands_in_a_wall_is_withdrawn_where_the_walls_are_known(mug, episode):
     for width, walled, found in ((0.12, False, 2), (0.12, True, 0), (0.5, True, 2)):
         # The mugs lie at x = -8 and 8 cm.
-        fusion = JointFusion(mug, weights=hand_set_weights(), tray=Tray(width, 1.0, 0.2), walled=walled)
+        fusion = AllViewsFusion(mug, weights=hand_set_weights(), tray=Tray(width, 1.0, 0.2), walled=walled)
         for view in episode:
             fusion.add_view(*view)
         objects = objects_of(fusion, episode[-1])
@@ -126,7 +126,7 @@ def test_what_stands_in_a_wall_is_withdrawn_where_the_walls_are_known(mug, episo
 
 @pytest.mark.parametrize(("shift", "below"), [(0.05, 0), (-0.005, 0), (-0.03, 2)])
 def test_objects_below_the_floor_are_counted(mug, episode, shift, below):
-    fusion = JointFusion(mug, weights=hand_set_weights())
+    fusion = AllViewsFusion(mug, weights=hand_set_weights())
     for stamp, T, *rest in episode:
         fusion.add_view(stamp, make_transform(np.eye(3), [0.0, 0.0, shift]) @ T, *rest)
     objects_of(fusion, episode[-1])
@@ -193,17 +193,17 @@ def test_nothing_seen_is_nothing_found(mug, episode):
 
 
 def test_another_view_computes_its_own_part_only(mug, episode, monkeypatch):
-    from active6d_perception.scene import joint_fusion
+    from active6d_perception.scene import all_views_fusion
 
     fusion = fuse(mug, episode[:3])
     objects_of(fusion, episode[2])
-    counted, count_cases = [], joint_fusion.count_cases
+    counted, count_cases = [], all_views_fusion.count_cases
 
     def count(T, *rest):
         counted.append((len(T), rest[-2]))
         return count_cases(T, *rest)
 
-    monkeypatch.setattr(joint_fusion, "count_cases", count)
+    monkeypatch.setattr(all_views_fusion, "count_cases", count)
     objects_of(fusion, episode[2])
     assert counted == []
     fusion.add_view(*episode[3])
@@ -227,7 +227,7 @@ def test_scattered_hypotheses_cost_no_more_than_their_number(mug, episode, monke
         return count
 
     monkeypatch.setattr(body_candidates, "_MOST_CLUSTERS", 30)
-    for module, name in ((joint_fusion, "count_cases"), (body_refinement, "normal_equations")):
+    for module, name in ((all_views_fusion, "count_cases"), (body_refinement, "normal_equations")):
         monkeypatch.setattr(module, name, counting(getattr(module, name)))
     fusion, rng, of_view = fuse(mug, []), np.random.default_rng(0), {}
     for number in range(1, 17):

@@ -1,4 +1,4 @@
-"""Fusion of all views by table look-up: :class:`.JointFusion` on the fixed candidates of a bank's scenes.
+"""Fusion of all views by table look-up: :class:`.AllViewsFusion` on the fixed candidates of a bank's scenes.
 
 "Poses" are the candidates' poses with each rotation, of all scenes one after the other. The objects of a
 :class:`.FusedBatch` are numbers of poses.
@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from active6d_agent.bank.batched_fusion import BatchedFusion
 from active6d_agent.bank.belief_kernel import Belief, SceneIndex, fuse_episode
+from active6d_agent.bank.best_view_lookup import BestViewLookup
 from active6d_agent.bank.scene_bank import BankScene, SceneBank, world_poses
 from active6d_agent.bank.scene_lookup import FusedBatch, SceneLookup
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
@@ -19,17 +19,17 @@ from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.ambiguity import Ambiguity, ambiguity_of
+from active6d_perception.scene.all_views_fusion import BESIDE
 from active6d_perception.scene.belief_weights import BeliefWeights, belief_path, load_belief
 from active6d_perception.scene.evidence_tables import EvidenceTables
 from active6d_perception.scene.expected_visibility import Tray
 from active6d_perception.scene.feasibility import against_container, against_neighbour
-from active6d_perception.scene.fusion import FusionParameters
+from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_perception.scene.hypothesis_table import confidence
-from active6d_perception.scene.joint_fusion import BESIDE
 
 
 @dataclass(frozen=True, eq=False)
-class JointBatch(FusedBatch):
+class AllViewsBatch(FusedBatch):
     """Accumulated objects with what fusion knows of their hypotheses.
 
     Attributes:
@@ -119,7 +119,7 @@ def _feasibility(
     return container[:, 0], turned, first, neighbour, np.ascontiguousarray(pairs), turned_pairs
 
 
-class JointLookup(SceneLookup):
+class AllViewsLookup(SceneLookup):
     """Fusion of all views; "poses" are those of the candidates with each rotation.
 
     Args:
@@ -152,7 +152,7 @@ class JointLookup(SceneLookup):
         errors = e_add(self.model, T[:, None], scene.T_world_object[None], cutoff=MISSED_E_ADD)
         return np.where(errors < MISSED_E_ADD, errors, np.inf)
 
-    def fuse(self, scene: np.ndarray, views: np.ndarray, current: np.ndarray) -> JointBatch:
+    def fuse(self, scene: np.ndarray, views: np.ndarray, current: np.ndarray) -> AllViewsBatch:
         """Fuse the views of E episodes; see :meth:`.SceneLookup.fuse`."""
         taken = np.asarray(views, np.int64)
         fused = [
@@ -169,7 +169,7 @@ class JointLookup(SceneLookup):
                 table[row, : len(values)] = shifted
             return table
 
-        return JointBatch(
+        return AllViewsBatch(
             pad("pose", -1, self.first_pose),
             pad("best", -1, self._first_row),
             pad("seen", -1, self._first_row),
@@ -191,12 +191,12 @@ class JointLookup(SceneLookup):
         return fused.description, right
 
     def _support(self, fused: FusedBatch) -> tuple[np.ndarray, np.ndarray]:
-        assert isinstance(fused, JointBatch), "of another look-up"
+        assert isinstance(fused, AllViewsBatch), "of another look-up"
         return fused.support, fused.spread
 
 
 def make_lookup(bank: SceneBank, parameters: FusionParameters | None = None) -> SceneLookup:
     """The look-up of the deployed fusion; of fusion by the best view for a bank without evidence."""
     if all(scene.evidence is not None for scene in bank.scenes):
-        return JointLookup(bank, parameters)
-    return BatchedFusion(bank, parameters)
+        return AllViewsLookup(bank, parameters)
+    return BestViewLookup(bank, parameters)
