@@ -12,7 +12,7 @@ from active6d_core.metrics import e_add
 from active6d_core.object_model import ObjectModel, load_object
 from active6d_core.se3 import invert, make_transform, quaternion_from_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.scene.observed_surface import SurfaceGrid, explainer
+from active6d_perception.scene.observed_surface import WorkspaceGrid, explainer
 
 
 def synthetic_scene(object_name: str, seed: int, objects: int, sphere: ViewSphere, noise: int = 0) -> BankScene:
@@ -50,7 +50,7 @@ def synthetic_scene(object_name: str, seed: int, objects: int, sphere: ViewSpher
 
 def _shown_surface(model: ObjectModel, T_world_object: np.ndarray, is_seen: np.ndarray) -> np.ndarray:
     """(M, b) packed bits: all cells that hold surface of the objects that a view sees, as (M, n) says."""
-    grid = SurfaceGrid.for_model(model)
+    grid = WorkspaceGrid.for_model(model)
     near = explainer(model, 0.05).explains(grid.centres, T_world_object)
     return np.packbits(is_seen.astype(np.uint8) @ near.astype(np.uint8) > 0, axis=1)
 
@@ -60,7 +60,7 @@ def synthetic_bank(object_name: str = "mug", scenes: int = 2, objects: int = 8, 
     sphere = ViewSphere()
     made = [synthetic_scene(object_name, seed, objects, sphere, noise) for seed in range(scenes)]
     return SceneBank(
-        object_name, sphere, SurfaceGrid.for_model(load_object(object_name)), made, {"estimator": "synthetic"}
+        object_name, sphere, WorkspaceGrid.for_model(load_object(object_name)), made, {"estimator": "synthetic"}
     )
 
 

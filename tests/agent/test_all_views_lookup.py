@@ -25,7 +25,7 @@ from active6d_perception.scene.body_candidates import BodyCandidates
 from active6d_perception.scene.feasibility import against_container, against_neighbour, combine_neighbours
 from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_perception.scene.object_probability import describe_objects
-from active6d_perception.scene.observed_surface import SurfaceGrid
+from active6d_perception.scene.observed_surface import WorkspaceGrid
 from active6d_perception.scene.scene_evidence import BodyEvidence, SceneEvidence
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.simulator import Simulator
@@ -59,7 +59,7 @@ def simulator():
 def bank(simulator, tmp_path_factory):
     """A bank that was written and read."""
     model, scene = load_object("mug"), simulator.scene
-    grid = SurfaceGrid.for_model(model)
+    grid = WorkspaceGrid.for_model(model)
     seen = observe_scene(
         scene.name,
         scene.T_world_object,

@@ -17,10 +17,10 @@ from active6d_core.metrics import e_add
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.scene.observed_surface import SurfaceGrid
+from active6d_perception.scene.observed_surface import WorkspaceGrid
 
 SPHERE = ViewSphere()
-GRID = SurfaceGrid.for_model(load_object("mug"))
+GRID = WorkspaceGrid.for_model(load_object("mug"))
 
 
 def assert_equal(a: BankScene, b: BankScene):

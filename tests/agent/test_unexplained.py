@@ -23,7 +23,7 @@ from active6d_core.ros.conversions import (
 from active6d_core.se3 import invert
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.nodes.hypothesis_fusion import HypothesisFusionNode
-from active6d_perception.scene.observed_surface import Explainer, SurfaceGrid
+from active6d_perception.scene.observed_surface import Explainer, WorkspaceGrid
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.simulator import Simulator
 
@@ -55,7 +55,7 @@ def simulator():
 def lookup(simulator, tmp_path_factory):
     """Of a bank that was written and read."""
     model, scene = load_object("mug"), simulator.scene
-    grid = SurfaceGrid.for_model(model)
+    grid = WorkspaceGrid.for_model(model)
     estimator, verifier = TwoOfThree(simulator), Verifier(model)
     seen = observe_scene(scene.name, scene.T_world_object, simulator.capture, estimator, verifier, model, SPHERE, grid)
     path = tmp_path_factory.mktemp("bank") / "bank.npz"

@@ -39,7 +39,7 @@ from active6d_perception.scene.belief_weights import BeliefWeights, Scorer, beli
 from active6d_perception.scene.best_view_fusion import BestViewFusion
 from active6d_perception.scene.expected_visibility import Tray
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
-from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
+from active6d_perception.scene.observed_surface import ObservedSurface, WorkspaceGrid
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.simulator import Simulator
@@ -396,8 +396,8 @@ def test_the_workspace_is_the_parameters(graph, tmp_path, monkeypatch):
     depth, messages = box_on_the_floor(SECOND)
     send(graph, messages, FUSION_INPUTS)
     graph.spin_until_filled([clouds])
-    usual = SurfaceGrid.for_model(load_object("mug"))
-    grid = SurfaceGrid((usual.width[0], 0.1), 0.03, 0.3, usual.cell)
+    usual = WorkspaceGrid.for_model(load_object("mug"))
+    grid = WorkspaceGrid((usual.width[0], 0.1), 0.03, 0.3, usual.cell)
     expected = unexplained_by_nothing([depth], grid)
     np.testing.assert_array_equal(points_from_cloud(clouds[0], "world"), expected)
     assert len(expected) > 0

@@ -9,7 +9,7 @@ from active6d_core.camera import DEFAULT_CAMERA
 from active6d_core.object_model import load_object
 from active6d_core.se3 import make_transform
 from active6d_core.view_sphere import ViewSphere
-from active6d_perception.scene.observed_surface import EXPLAINED_WITHIN, Explainer, ObservedSurface, SurfaceGrid
+from active6d_perception.scene.observed_surface import EXPLAINED_WITHIN, Explainer, ObservedSurface, WorkspaceGrid
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene import Bin
 from active6d_sim.scenes.scene_store import load_scene
@@ -53,7 +53,7 @@ def test_cells_are_seen_where_three_points_lie(render, view, scale, stride):
     model, rng = load_object("mug"), np.random.default_rng(view)
     depth, _ = render(model, make_transform(Rotation.random(rng=rng).as_matrix(), [0.02, 0.01, 0.79])[None], camera)
     depth[rng.random(depth.shape) < 0.2] = np.nan
-    grid = SurfaceGrid((0.2, 0.15), -0.06, 0.09, 0.017)
+    grid = WorkspaceGrid((0.2, 0.15), -0.06, 0.09, 0.017)
     T_world_camera = SPHERE.pose(SPHERE.positions[view])
     counts = count_points(grid, depth, camera, T_world_camera, stride)
     seen = grid.observe(depth, camera, T_world_camera)
@@ -63,7 +63,7 @@ def test_cells_are_seen_where_three_points_lie(render, view, scale, stride):
 
 def test_a_camera_within_or_turned_away_from_the_box():
     """No part of the image can be left out, or all of it."""
-    grid, camera = SurfaceGrid((0.8, 0.8), -0.4, 0.4, 0.1), DEFAULT_CAMERA.scaled(0.1)
+    grid, camera = WorkspaceGrid((0.8, 0.8), -0.4, 0.4, 0.1), DEFAULT_CAMERA.scaled(0.1)
     depth = np.random.default_rng(0).uniform(0.1, 0.6, (camera.height, camera.width))
     T_world_camera = make_transform(Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix(), [0.1, 0.0, -0.1])
     seen = grid.observe(depth, camera, T_world_camera)
@@ -74,7 +74,7 @@ def test_a_camera_within_or_turned_away_from_the_box():
 
 
 def test_centres_are_numbered_as_cells_are():
-    grid = SurfaceGrid((0.3, 0.2), 0.01, 0.11, 0.05)
+    grid = WorkspaceGrid((0.3, 0.2), 0.01, 0.11, 0.05)
     assert grid.shape == (6, 4, 2)
     assert len(grid) == len(grid.centres) == 48
     np.testing.assert_allclose(grid.centres[0], [-0.125, -0.075, 0.035], atol=1e-8)
@@ -84,7 +84,7 @@ def test_centres_are_numbered_as_cells_are():
 @pytest.mark.parametrize("name", ["mug", "bunny", "coffee_cup"])
 def test_the_usual_grid_fills_the_usual_bin(name):
     model = load_object(name)
-    grid, tray = SurfaceGrid.for_model(model), Bin.for_model(model)
+    grid, tray = WorkspaceGrid.for_model(model), Bin.for_model(model)
     gap = np.array([tray.inner_width, tray.inner_depth]) / 2 - np.abs(grid.centres[:, :2]).max(axis=0) - grid.cell / 2
     assert (gap > 0.03 * model.diameter).all()
     assert (gap < 0.1 * model.diameter).all()
@@ -97,13 +97,13 @@ def test_the_usual_grid_fills_the_usual_bin(name):
 )
 def test_impossible_grids_are_refused(sizes):
     with pytest.raises(ValueError, match="surface grid"):
-        SurfaceGrid(*sizes)
+        WorkspaceGrid(*sizes)
 
 
 @pytest.mark.parametrize("cell", [0.0, -0.01, np.nan])
 def test_impossible_cells_are_refused(cell):
     with pytest.raises(ValueError, match="surface grid: sizes must be finite and the cell positive"):
-        SurfaceGrid((0.3, 0.3), 0.0, 0.1, cell)
+        WorkspaceGrid((0.3, 0.3), 0.0, 0.1, cell)
 
 
 def test_explained_is_what_is_near_the_mesh():

@@ -14,7 +14,7 @@ from active6d_core.object_model import load_object
 from active6d_core.registry import AUTOMATIC
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.estimators.registry import create_estimator, weights_path
-from active6d_perception.scene.observed_surface import SurfaceGrid
+from active6d_perception.scene.observed_surface import WorkspaceGrid
 from active6d_perception.scene.verification import Verifier
 from active6d_sim.rendering.random_sensor import sensor_of
 from active6d_sim.rendering.simulator import Simulator
@@ -78,7 +78,7 @@ def observe_scene_by_name(
     else:
         scene = find_scene(object_name, "", int(number)) if kind == "seed" else find_scene(object_name, name, 0)
     simulator = Simulator(scene, noise=sensor_of(sensor, model, scene).scaled(noise), seed=seed)
-    sphere, grid = ViewSphere(), SurfaceGrid.for_model(model)
+    sphere, grid = ViewSphere(), WorkspaceGrid.for_model(model)
     observed = observe_scene(
         name,
         scene.T_world_object,

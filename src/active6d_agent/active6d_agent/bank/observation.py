@@ -24,7 +24,7 @@ from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.belief_weights import BeliefWeights
 from active6d_perception.scene.evidence_tables import tabulate
 from active6d_perception.scene.measured_view import MeasuredView, measure_view
-from active6d_perception.scene.observed_surface import SurfaceGrid
+from active6d_perception.scene.observed_surface import WorkspaceGrid
 from active6d_perception.scene.verification import Verifier
 
 
@@ -97,7 +97,7 @@ class ObservedView:
 
 
 def observe_view(
-    view: View, estimator: Estimator, verifier: Verifier, grid: SurfaceGrid, ambiguity: Ambiguity
+    view: View, estimator: Estimator, verifier: Verifier, grid: WorkspaceGrid, ambiguity: Ambiguity
 ) -> ObservedView:
     """Run estimator and verification on one view; the arguments are as for :func:`observe_scene`."""
     hypotheses = estimator.estimate(view)
@@ -124,7 +124,7 @@ def observe_scene(
     verifier: Verifier,
     model: ObjectModel,
     sphere: ViewSphere,
-    grid: SurfaceGrid,
+    grid: WorkspaceGrid,
     *,
     views: Path | None = None,
 ) -> BankScene:

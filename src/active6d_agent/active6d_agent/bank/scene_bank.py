@@ -30,7 +30,7 @@ from active6d_core.se3 import transform_from_quaternion
 from active6d_core.structured_text import parse_json
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.scene.evidence_tables import EvidenceTables
-from active6d_perception.scene.observed_surface import SurfaceGrid
+from active6d_perception.scene.observed_surface import WorkspaceGrid
 
 FORMAT = 3
 #: Banks of this format have no evidence; their look-up fuses by the best view.
@@ -94,7 +94,7 @@ def build_bank(
     workers: int = 1,
     provenance: dict[str, Any] | None = None,
     sphere: ViewSphere | None = None,
-    grid: SurfaceGrid | None = None,
+    grid: WorkspaceGrid | None = None,
     on_drop: Callable[[list[str]], None] = lambda names: None,
 ) -> Iterator[str]:
     """Observe all scenes and write the bank; yields each scene's name as it is done.
@@ -115,7 +115,7 @@ def build_bank(
         grid: of the surface, the object's usual one when None.
         on_drop: called before the work with the names of scenes that the existing bank has and the new one will not.
     """
-    grid = grid or SurfaceGrid.for_model(load_object(object_name))
+    grid = grid or WorkspaceGrid.for_model(load_object(object_name))
     empty = SceneBank(object_name, sphere or ViewSphere(), grid, [], provenance or {})
     stored = _stored_bank(path)
     known = _scenes_made_as(stored, empty)
@@ -184,7 +184,7 @@ class SceneBank:
 
     object_name: str
     sphere: ViewSphere
-    grid: SurfaceGrid
+    grid: WorkspaceGrid
     scenes: Sequence[BankScene]
     provenance: dict[str, Any]
 
@@ -277,7 +277,7 @@ def load_bank(path: Path) -> SceneBank:
             raise ValueError(f"format {header['format']}, this version reads {FORMAT}")
         sphere = ViewSphere(header["radius"], tuple(header["elevations_degrees"]), header["azimuths"])
         surface = header["surface"]
-        grid = SurfaceGrid(**{**surface, "width": tuple(surface["width"])})
+        grid = WorkspaceGrid(**{**surface, "width": tuple(surface["width"])})
         _check_counts(data, len(header["scenes"]), len(sphere))
         scenes = [_read_scene(data, index, name) for index, name in enumerate(header["scenes"])]
         return SceneBank(header["object"], sphere, grid, scenes, header["provenance"])

@@ -38,7 +38,7 @@ from active6d_perception.scene.best_view_fusion import BestViewFusion
 from active6d_perception.scene.camera_alignment import CameraAlignment
 from active6d_perception.scene.expected_visibility import Tray
 from active6d_perception.scene.fusion_parameters import METHODS, RANKINGS, FusionParameters
-from active6d_perception.scene.observed_surface import ObservedSurface, SurfaceGrid
+from active6d_perception.scene.observed_surface import ObservedSurface, WorkspaceGrid
 from active6d_perception.scene.verification import Verifier
 
 #: What belongs to a view beside the camera's topics, part to topic.
@@ -191,8 +191,8 @@ class HypothesisFusionNode(GraphNode):
         walled = self.value("bin_width") > 0
         return AllViewsFusion(self._model, parameters, tray=tray, walled=walled, align=self.value("align_views"))
 
-    def _make_grid(self) -> SurfaceGrid:
-        usual = SurfaceGrid.for_model(self._model)
+    def _make_grid(self) -> WorkspaceGrid:
+        usual = WorkspaceGrid.for_model(self._model)
         sides, floor, height = (self.value(f"workspace_{name}") for name in ("width", "floor", "height"))
         width: Any = tuple(side or own for side, own in zip(sides, usual.width, strict=False))  # the grid checks it
         try:

@@ -29,7 +29,7 @@ EXPLAINED_WITHIN = 0.08
 
 
 @dataclass(frozen=True)
-class SurfaceGrid:
+class WorkspaceGrid:
     """A grid of axis-aligned cells over the workspace, centred above the world's origin.
 
     Cells are numbered ``(ix * ny + iy) * nz + iz``, each index rising along its axis.
@@ -57,7 +57,7 @@ class SurfaceGrid:
             raise ValueError(f"surface grid: {self} has {self.shape} cells, expected one to a million")
 
     @classmethod
-    def for_model(cls, model: ObjectModel) -> "SurfaceGrid":
+    def for_model(cls, model: ObjectModel) -> "WorkspaceGrid":
         """The grid over the bin that the object's heaps usually lie in.
 
         Margins exclude the sensor's noise on walls and floor (measured in ``docs/perception.md``).
@@ -219,8 +219,8 @@ class ObservedSurface:
         within: see :class:`Explainer`.
     """
 
-    def __init__(self, model: ObjectModel, grid: SurfaceGrid | None = None, within: float = EXPLAINED_WITHIN) -> None:
-        self.grid = grid or SurfaceGrid.for_model(model)
+    def __init__(self, model: ObjectModel, grid: WorkspaceGrid | None = None, within: float = EXPLAINED_WITHIN) -> None:
+        self.grid = grid or WorkspaceGrid.for_model(model)
         self._explainer = explainer(model, within)
         _count(np.zeros((3, 0), np.float32), self.grid.shape)  # compile now, so that no view has to wait
         self.reset()
@@ -230,7 +230,7 @@ class ObservedSurface:
         self._seen: dict[int, np.ndarray] = {}
 
     def add_view(self, stamp: int, depth: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray) -> None:
-        """Add a view, identified by its stamp (nanoseconds); other arguments as for :meth:`SurfaceGrid.observe`."""
+        """Add a view, identified by its stamp (nanoseconds); other arguments as for :meth:`WorkspaceGrid.observe`."""
         self._seen[stamp] = self.grid.observe(depth, camera, T_world_camera)
 
     def forget_before(self, stamp: int) -> None:
