@@ -96,7 +96,8 @@ def test_only_the_probability_is_fitted_to_banks(bunny_bank, monkeypatch):
     fitted, measured = refit_probability(weights, [bunny_bank], episodes=4, seed=5)
     assert fitted.rotation is weights.rotation
     assert fitted.body is weights.body
-    lookup, model, rows, right = AllViewsLookup(bunny_bank, weights=weights), load_object("bunny"), [], []
+    belief = replace(weights, probability=BeliefWeights.indifferent().probability)
+    lookup, model, rows, right = AllViewsLookup(bunny_bank, weights=belief), load_object("bunny"), [], []
     for index, scene in enumerate(bunny_bank.scenes):
         rng = np.random.default_rng([5, index])
         for count in (3, 1, 3, 1):
@@ -117,6 +118,12 @@ def test_only_the_probability_is_fitted_to_banks(bunny_bank, monkeypatch):
     assert best < loss(weights.probability.linear)
     for step in np.random.default_rng(0).normal(0, 0.1, (20, len(OBJECT_COLUMNS))):
         assert best < loss(fitted.probability.linear + step)
+
+
+def test_a_second_fit_is_the_first(bunny_bank):
+    first, _ = refit_probability(load_belief(belief_path("bunny")), [bunny_bank], episodes=2)
+    second, _ = refit_probability(first, [bunny_bank], episodes=2)
+    np.testing.assert_array_equal(second.probability.linear, first.probability.linear)
 
 
 def test_scenes_of_the_belief_do_not_fit_the_probability(bunny_bank):

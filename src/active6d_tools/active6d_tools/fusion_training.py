@@ -91,8 +91,10 @@ def refit_probability(
         ValueError: a bank has no evidence, or there is no other scene.
     """
     rows, right, names = [], [], []
+    # Objects are suppressed by their probability. An earlier fit must not decide which ones the new fit sees.
+    belief = replace(weights, probability=BeliefWeights.indifferent().probability)
     for bank in banks:
-        lookup = AllViewsLookup(bank, weights=weights)
+        lookup = AllViewsLookup(bank, weights=belief)
         for index, scene in enumerate(bank.scenes):
             if scene.name.split("/")[1] == BELIEF_SPLIT:
                 continue
