@@ -156,17 +156,20 @@ class AllViewsLookup(SceneLookup):
         """Fuse the views of E episodes; see :meth:`.SceneLookup.fuse`."""
         taken = np.asarray(views, np.int64)
         fused = [
-            fuse_episode(self.scenes[index], np.unique(row[row >= 0]), int(now), self._belief)
+            fuse_episode(self.scenes[index], row, now, self._belief)
             for index, row, now in zip(scene.tolist(), taken, current.tolist(), strict=True)
         ]
-        most = max((len(each.pose) for each in fused), default=0)
+        count = np.array([len(each.pose) for each in fused], int)
+        rows = np.repeat(np.arange(len(fused)), count)
+        places = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
 
         def pad(name: str, nothing: float, first: np.ndarray | None = None) -> np.ndarray:
-            table = np.full((len(fused), most), nothing)
-            for row, (index, each) in enumerate(zip(scene, fused, strict=True)):
-                values = getattr(each, name)
-                shifted = values if first is None else np.where(values >= 0, values + first[index], -1)
-                table[row, : len(values)] = shifted
+            table = np.full((len(fused), count.max(initial=0)), nothing)
+            if fused:
+                values = np.concatenate([getattr(each, name) for each in fused])
+                table[rows, places] = (
+                    values if first is None else np.where(values >= 0, values + first[scene[rows]], -1)
+                )
             return table
 
         return AllViewsBatch(
@@ -185,7 +188,7 @@ class AllViewsLookup(SceneLookup):
         Returns:
             (n, columns) descriptions of the n objects, see :data:`.OBJECT_COLUMNS`, and (n,) bool, which are right.
         """
-        fused = fuse_episode(self.scenes[scene], np.sort(views), int(views[-1]), self._belief)
+        fused = fuse_episode(self.scenes[scene], views, int(views[-1]), self._belief)
         errors = self.errors[self.first_pose[scene] + fused.pose, : self.object_count[scene]]
         right: np.ndarray = np.any(errors < DETECTION_FRACTION * self.model.diameter, axis=1)
         return fused.description, right

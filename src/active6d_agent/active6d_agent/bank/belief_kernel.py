@@ -437,7 +437,8 @@ def _body_odds(
 
 @compiled
 def fuse_episode(scene: SceneIndex, views: np.ndarray, current: int, belief: Belief) -> FusedEpisode:
-    """Fuse (v,) different views, of which ``current`` is where the camera is."""
+    """Fuse (v,) views, -1 and repetitions of which are ignored; ``current`` is where the camera is."""
+    views = np.unique(views[views >= 0])
     K, R, places = len(scene.place), scene.telling.shape[2], scene.place.max() + 1
     bodies, near = np.empty((K, CASES), np.float32), np.empty((K, 2))
     rows, evidence, heads, body_odds = _body_odds(scene, views, belief, bodies, near)
