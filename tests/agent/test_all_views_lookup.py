@@ -50,28 +50,31 @@ class GuessesHandles:
         return Hypotheses.from_masks(T, self.rng.uniform(0.4, 0.9, len(T)), np.array(found) + 1, masks, view.depth)
 
 
+class FindsNothing:
+    """An estimator for which the scene is empty."""
+
+    def estimate(self, view):
+        return Hypotheses.empty(*view.depth.shape)
+
+
 @pytest.fixture(scope="module")
 def simulator():
     return Simulator(three_mugs())
 
 
+def observed(simulator, estimator):
+    """The scene as a bank keeps it."""
+    model, scene = load_object("mug"), simulator.scene
+    parts = scene.name, scene.T_world_object, simulator.capture, estimator, Verifier(model), model
+    return observe_scene(*parts, SPHERE, WorkspaceGrid.for_model(model))
+
+
 @pytest.fixture(scope="module")
 def bank(simulator, tmp_path_factory):
     """A bank that was written and read."""
-    model, scene = load_object("mug"), simulator.scene
-    grid = WorkspaceGrid.for_model(model)
-    seen = observe_scene(
-        scene.name,
-        scene.T_world_object,
-        simulator.capture,
-        GuessesHandles(simulator),
-        Verifier(model),
-        model,
-        SPHERE,
-        grid,
-    )
     path = tmp_path_factory.mktemp("bank") / "bank.npz"
-    SceneBank("mug", SPHERE, grid, [seen], {}).save(path)
+    seen = observed(simulator, GuessesHandles(simulator))
+    SceneBank("mug", SPHERE, WorkspaceGrid.for_model(load_object("mug")), [seen], {}).save(path)
     return load_bank(path)
 
 
@@ -161,6 +164,17 @@ def test_the_look_up_finds_what_the_node_finds(bank, simulator):
     assert len(node) == len(table)
     np.testing.assert_allclose(np.sort(node.probability), np.sort(table.probability), atol=0.15)
     assert sorted(node.support) == sorted(table.support)
+
+
+def test_a_scene_in_which_nothing_was_found_has_no_object(bank, simulator, tmp_path):
+    scenes = [replace(observed(simulator, FindsNothing()), name="mug/val/1"), *bank.scenes]
+    replace(bank, scenes=scenes).save(tmp_path / "bank.npz")
+    lookup = make_lookup(load_bank(tmp_path / "bank.npz"))
+    views = np.array([[0, 4, 9], [0, 4, 9]])
+    fused = lookup.fuse(np.array([0, 1]), views, views[:, -1])
+    assert (fused.objects >= 0).sum(axis=1).tolist() == [0, 3]
+    assert len(lookup.fuse(np.zeros(2, int), views, views[:, -1]).objects[0]) == 0
+    assert len(lookup.describe_fused(0, np.array([1, 2]))[1]) == 0
 
 
 def test_a_bank_without_evidence_is_fused_by_the_best_view(bank):

@@ -16,8 +16,19 @@ from active6d_perception.model.ambiguity import ambiguity_of
 from active6d_perception.scene import all_views_fusion, body_candidates, body_refinement
 from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.belief_weights import BeliefWeights, Scorer
+from active6d_perception.scene.camera_alignment import CameraAlignment
 from active6d_perception.scene.expected_visibility import OPEN_TABLE, Tray
-from active6d_perception.scene.measured_cases import CASES, FITTING, LOOKED_THROUGH, WHAT, WHOSE
+from active6d_perception.scene.feasibility import against_container
+from active6d_perception.scene.measured_cases import (
+    CASES,
+    FITTING,
+    LOOKED_THROUGH,
+    NOT_MEASURED,
+    WHAT,
+    WHOSE,
+    count_cases,
+)
+from active6d_perception.scene.measured_view import measure_view
 from active6d_perception.scene.object_probability import OBJECT_COLUMNS
 from active6d_perception.scene.scene_evidence import BODY_COLUMNS, ROTATION_COLUMNS
 
@@ -131,6 +142,45 @@ def test_objects_below_the_floor_are_counted(mug, episode, shift, below):
         fusion.add_view(stamp, make_transform(np.eye(3), [0.0, 0.0, shift]) @ T, *rest)
     objects_of(fusion, episode[-1])
     assert fusion.below_floor == below
+
+
+def test_the_container_is_in_the_world_and_not_in_the_first_views_frame(mug, episode, monkeypatch):
+    before = fuse(mug, episode).evidence().bodies
+    anchor = make_transform(np.eye(3), [0.0, 0.0, -0.03])
+    monkeypatch.setattr(CameraAlignment, "T_world_anchor", property(lambda _: anchor))
+    fusion = fuse(mug, episode)
+    after = fusion.evidence().bodies
+    np.testing.assert_array_equal(after.candidates.T_world_object, before.candidates.T_world_object)
+    np.testing.assert_allclose(after.container[:, 1], before.container[:, 1] - 0.03, atol=1e-9)
+    objects_of(fusion, episode[-1])
+    assert fusion.below_floor == 2
+
+
+def test_a_wall_of_height_0_is_none():
+    rng = np.random.default_rng(0)
+    T = make_transform(Rotation.random(20, rng=rng).as_matrix(), rng.uniform(-0.3, 0.3, (20, 3)))
+    parts = T, np.eye(4)[None], rng.uniform(-0.05, 0.05, (30, 3))
+    none, low = (against_container(*parts, tray, 1.0) for tray in (OPEN_TABLE, Tray(0.1, 0.1, 0.0)))
+    np.testing.assert_array_equal(low, none)
+    assert against_container(*parts, Tray(0.1, 0.1, 0.01), 1.0)[..., 2].max() > 0
+
+
+@pytest.mark.parametrize("offset", [[0.6, 0.0, 0.001], [0.0, 0.5, 0.05], [-0.4, 0.4, 0.02]])
+def test_a_camera_that_looks_past_an_object_says_little_of_it(mug, episode, offset):
+    """No more than a camera as far away that looks at it and measures nothing."""
+    depth, camera = episode[0][-2:]
+    blank, none = np.full_like(depth, np.nan), Hypotheses.empty(*depth.shape)
+    past, at = np.eye(4), np.eye(4)
+    # The camera looks along z; the mug is beside it, hardly before the plane of the camera.
+    past[:3, 3] = TRUE[0, :3, 3] - offset
+    at[:3, 3] = TRUE[0, :3, 3] - [0.0, 0.0, np.linalg.norm(offset)]
+    counts = []
+    for T_world_camera in (past, at):
+        view = measure_view(blank, camera, T_world_camera, none, ambiguity_of(mug))
+        samples = ambiguity_of(mug).body_samples
+        each = count_cases(TRUE[:1], np.eye(4)[None], ambiguity_of(mug).middle, 0.0, samples, view, 1.0)
+        counts.append(each.reshape(WHAT, WHOSE)[NOT_MEASURED].sum())
+    assert counts[0] < 2 * counts[1]
 
 
 def resized(T, scale):

@@ -18,6 +18,7 @@ from active6d_perception.scene.best_view_fusion import BestViewFusion, cluster, 
 from active6d_perception.scene.clustering import cluster_groups
 from active6d_perception.scene.fusion_parameters import FusionParameters
 from active6d_perception.scene.object_features import project_features
+from active6d_perception.suppression import suppress_neighbours
 
 NAMES = ("coffee_cup", "bunny", "mug")
 SPHERE = ViewSphere()
@@ -257,3 +258,10 @@ def test_bad_parameters_and_scores_are_named():
     stamp, T, hypotheses, verification = episode[0]
     with pytest.raises(ValueError, match="verification scores for"):
         BestViewFusion(load_object("mug")).add_view(stamp, T, hypotheses, verification[:-1])
+
+
+def test_an_exclusion_of_0_keeps_objects_at_the_same_place():
+    """Rounding made their squared distance negative, and closer than 0."""
+    positions = np.random.default_rng(0).uniform(-1, 1, (200, 1, 3)).repeat(2, axis=1)
+    assert suppress_neighbours(positions, np.ones((200, 2), bool), 0.0).all()
+    assert suppress_neighbours(positions, np.ones((200, 2), bool), 1e-3).sum() == 200

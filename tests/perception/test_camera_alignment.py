@@ -141,6 +141,26 @@ def test_a_view_that_shows_nothing_keeps_its_pose_and_holds_no_other(measured):
     assert len(cameras.T_world_cameras()) == 3
 
 
+def test_a_first_view_of_something_else_does_not_keep_the_others_from_being_aligned(measured):
+    """As of a robot whose first picture is of the table beside the bin."""
+    wrong = wrong_poses(measured, PoseError(10.0, 1.0), 1)
+    elsewhere = move_view(measured[3], make_transform(np.eye(3), [3.0, 0.0, 0.0]) @ invert(measured[3].T_camera_world))
+    cameras = CameraAlignment()
+    cameras.add_view(-1, elsewhere)
+    aligned = [cameras.add_view(index, view) for index, view in enumerate(wrong)]
+    alone = CameraAlignment()
+    expected = [alone.add_view(index, view) for index, view in enumerate(wrong)]
+    for one, other in zip(aligned, expected, strict=True):
+        np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
+    assert cameras.alignment(-1).aligned
+    assert not cameras.alignment(0).aligned, "nothing shows whether its pose is right"
+    assert all(cameras.alignment(index).aligned for index in range(1, len(wrong)))
+    # The first view's correction, which is none, stands in for that of the view that the others were aligned with.
+    middle = PLACES.mean(axis=0)[None]
+    moved = [transform_points(each.T_world_anchor, middle)[0] for each in (cameras, alone)]
+    assert np.linalg.norm(moved[0] - moved[1]) < 0.002
+
+
 def test_an_error_beyond_reach_is_reported_and_not_corrected(measured):
     cameras = CameraAlignment()
     cameras.add_view(0, measured[0])

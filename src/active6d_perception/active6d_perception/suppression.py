@@ -43,7 +43,8 @@ def suppress_neighbours(positions: np.ndarray, valid: np.ndarray, exclusion: flo
     kept = valid.copy()
     norm = (positions**2).sum(axis=-1)
     squared = norm[:, :, None] + norm[:, None] - 2.0 * positions @ np.swapaxes(positions, 1, 2)
-    _drop(squared < exclusion**2, kept)
+    # Of equal positions, rounding may leave less than 0, which would be closer than an exclusion of 0.
+    _drop(np.maximum(squared, 0.0) < exclusion**2, kept)
     return kept
 
 

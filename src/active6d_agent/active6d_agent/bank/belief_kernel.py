@@ -439,7 +439,11 @@ def _body_odds(
 def fuse_episode(scene: SceneIndex, views: np.ndarray, current: int, belief: Belief) -> FusedEpisode:
     """Fuse (v,) views, -1 and repetitions of which are ignored; ``current`` is where the camera is."""
     views = np.unique(views[views >= 0])
-    K, R, places = len(scene.place), scene.telling.shape[2], scene.place.max() + 1
+    K, R = len(scene.place), scene.telling.shape[2]
+    if K == 0:
+        none, nothing = np.empty(0, np.int64), np.empty(0)
+        return FusedEpisode(none, nothing, nothing, none, none, none, nothing, np.empty((0, _OBJECT)))
+    places = scene.place.max() + 1
     bodies, near = np.empty((K, CASES), np.float32), np.empty((K, 2))
     rows, evidence, heads, body_odds = _body_odds(scene, views, belief, bodies, near)
     odds, rotations, with_rows = np.empty((K, R)), np.empty((R, _ROTATION), np.float32), 0

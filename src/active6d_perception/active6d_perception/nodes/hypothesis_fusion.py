@@ -45,10 +45,6 @@ from active6d_perception.scene.verification import Verifier
 _OTHERS = {"hypotheses": "hypotheses", "segmentation": "hypotheses/segmentation"}
 
 
-#: More than this share of the objects below the floor shows that the floor is wrong.
-_FEW = 0.25
-
-
 class HypothesisFusionNode(GraphNode):
     """Subscribes to hypotheses with label images, depth and the camera's pose; publishes ``objects``,
     ``objects/poses``, ``objects/markers`` and ``objects/unexplained``.
@@ -245,21 +241,20 @@ class HypothesisFusionNode(GraphNode):
             if aligned.shift:
                 summary.append(f"the camera's pose was corrected by {1e3 * aligned.shift:.1f} mm at the scene")
             if isinstance(self._fusion, AllViewsFusion):
-                self._report_container(self._fusion, len(objects))
+                self._report_container(self._fusion)
             if not aligned.aligned:
                 summary.append("the depth image could not be aligned with the others, the camera's pose is as given")
 
-    def _report_container(self, fusion: AllViewsFusion, count: int) -> None:
+    def _report_container(self, fusion: AllViewsFusion) -> None:
         """Say what is probably wrong where many objects are outside of the container."""
         if fusion.in_walls:
             self.say_once(
                 f"{fusion.in_walls} objects stand in the bin's walls and are withdrawn; if they are right, "
                 "correct bin_width, bin_depth, wall_height or the world's origin"
             )
-        # Single wrong poses reach below the floor, too.
-        if fusion.below_floor > max(1, _FEW * count):
+        if fusion.below_floor:
             self.say_once(
-                f"{fusion.below_floor} objects reach more than 1 cm below the bin's floor and so are improbable; "
+                f"{fusion.below_floor} objects reach below the bin's floor and so are improbable; "
                 "is the floor at z = 0 of the world?"
             )
 

@@ -49,8 +49,9 @@ _BODY_GATES, _BODY_LATTICE = (0.008, 0.004, 0.004), 0.002
 WHOLE_GATES, _WHOLE_LATTICE = (0.008, 0.004), 0.0005
 #: A body with more of its surface than this beyond a wall stands in it.
 _IN_WALL = 0.25
-#: A body that reaches deeper below the floor than this is wrong, or the floor is; metres.
-_SUNK = 0.012
+#: A body that reaches deeper below the floor than this is wrong, or the floor is, metres; the floor if there are more
+#: than this share of them.
+_SUNK, _FEW = 0.012, 0.25
 #: A body whose log-odds are this far below those of the best at its place is dropped.
 HOPELESS = 12.0
 # Evidence is taken at poses on this lattice, metres.
@@ -111,7 +112,8 @@ class AllViewsFusion:
     ) -> None:
         self.parameters = parameters or FusionParameters()
         self._align, self.cameras, self._walled = align, CameraAlignment(), walled
-        #: How many objects were last withdrawn because they stand in a wall, and how many reach below the floor.
+        #: How many objects were last withdrawn because they stand in a wall, and, if many do, how many reach below the
+        #: floor.
         self.in_walls = self.below_floor = 0
         self.ambiguity: Ambiguity = ambiguity_of(model)
         self.weights = weights or load_belief(belief_path(model.name))
@@ -267,11 +269,14 @@ class AllViewsFusion:
     def _in_container(self, candidates: BodyCandidates, part: _Part) -> np.ndarray:
         """(K, r, 5), see :func:`.against_container`."""
         rounded, keys = self._rounded(candidates)
+        # The container is in the world, the candidates are in the frame of the corrected camera poses.
+        anchor = self.cameras.T_world_anchor
+        in_world = anchor @ rounded
 
         def compute(missing: np.ndarray) -> np.ndarray:
-            return against_container(rounded[missing], part.rotations, part.points, self._tray, self.ambiguity.scale)
+            return against_container(in_world[missing], part.rotations, part.points, self._tray, self.ambiguity.scale)
 
-        return self._feasible.rows([(part.name, key) for key in keys], compute)
+        return self._feasible.rows([(part.name, anchor.tobytes(), key) for key in keys], compute)
 
     def _among_neighbours(
         self, candidates: BodyCandidates, heads: tuple[np.ndarray, list[bytes]], part: _Part
@@ -366,7 +371,8 @@ class AllViewsFusion:
 
     def _check_container(self, container: np.ndarray, probability: np.ndarray) -> np.ndarray:
         """(n,) probabilities, 0 of objects in walls; counts these and objects below the floor, by (n, 5) columns."""
-        self.below_floor = int(np.count_nonzero(container[:, 1] < -_SUNK))
+        sunk = int(np.count_nonzero(container[:, 1] < -_SUNK))
+        self.below_floor = sunk if sunk > max(1, _FEW * len(container)) else 0
         if not self._walled:
             return probability
         impossible = container[:, 2] > _IN_WALL

@@ -4,7 +4,8 @@ A robot knows the pose of its camera to some millimetres and tenths of a degree.
 aligned with those of the nearest views before it. Instances look alike, so the surfaces are compared and not the
 objects: what is beside and below them tells as much. Poses that are right to a millimetre are left as they are.
 
-The first view keeps its pose, so all corrected poses are in a frame that is off by the error of the first view. The
+The first view keeps its pose, so all corrected poses are in a frame that is off by the error of the first view. A view
+that shows nothing of what the views before it show keeps its pose as well, and later views are aligned with both. The
 errors of several views cancel: the mean of all corrections estimates that of the first view, see
 :attr:`CameraAlignment.T_world_anchor`.
 """
@@ -72,6 +73,8 @@ class _AlignedView:
     alignment: Alignment
     middle: np.ndarray
     """(3,) of what was measured, metres"""
+    is_reference: bool
+    """whether later views are aligned with it"""
 
 
 _AS_GIVEN = Alignment(np.eye(4))
@@ -116,16 +119,16 @@ class CameraAlignment:
             The view with the corrected pose.
         """
         points, normals = _surface(measured)
-        if len(points) < _LEAST_PAIRS:
-            found = Alignment(np.eye(4), aligned=False)
-        else:
-            near = self._nearest(measured.T_camera_world)
-            found = _align(points, normals, near) if near else _AS_GIVEN
+        enough = len(points) >= _LEAST_PAIRS
+        near = self._nearest(measured.T_camera_world, points) if enough else []
+        is_first = enough and not any(view.is_reference for view in self._views.values())
+        found = _align(points, normals, near) if near else Alignment(np.eye(4), aligned=is_first)
         moved = measured
         if found.shift:  # a pose that is not corrected stays the same to the last bit
             moved = move_view(measured, found.correction @ invert(measured.T_camera_world))
         middle = transform_points(found.correction, points).mean(axis=0) if len(points) else np.zeros(3)
-        self._views[stamp] = _AlignedView(moved, found, middle)
+        # One that disagrees with the views before it is wrong; one that shows something else need not be.
+        self._views[stamp] = _AlignedView(moved, found, middle, found.aligned or (enough and not near))
         return moved
 
     def alignment(self, stamp: int) -> Alignment:
@@ -152,11 +155,25 @@ class CameraAlignment:
         T_anchor_camera = [invert(view.measured.T_camera_world) for view in self._views.values()]
         return self.T_world_anchor @ np.reshape(T_anchor_camera, (-1, 4, 4))
 
-    def _nearest(self, T_camera_world: np.ndarray) -> list[MeasuredView]:
-        """The aligned views whose cameras look in the most similar directions."""
-        aligned = [view.measured for view in self._views.values() if view.alignment.aligned]
-        alike = np.array([view.T_camera_world[2, :3] @ T_camera_world[2, :3] for view in aligned])
-        return [aligned[index] for index in np.argsort(-alike, kind="stable")[:_NEAREST]]
+    def _nearest(self, T_camera_world: np.ndarray, points: np.ndarray) -> list[MeasuredView]:
+        """The references that show some of (n, 3) points and whose cameras look in the most similar directions."""
+        some, references = points[:: len(points) // _LEAST_PAIRS], []
+        for view in self._views.values():
+            if view.is_reference and _shows(view.measured, some):
+                references.append(view.measured)
+        alike = np.array([view.T_camera_world[2, :3] @ T_camera_world[2, :3] for view in references])
+        return [references[index] for index in np.argsort(-alike, kind="stable")[:_NEAREST]]
+
+
+def _shows(view: MeasuredView, points: np.ndarray) -> bool:
+    """Whether a view measured something near one of (n, 3) points in the world."""
+    x, y, z = transform_points(view.T_camera_world, points).T
+    z = np.maximum(z, 1e-3)
+    u, v = np.rint(x / z * view.fx + view.cx), np.rint(y / z * view.fy + view.cy)
+    height, width = view.depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    depth = view.depth[v[inside].astype(int), u[inside].astype(int)]
+    return bool((np.abs(depth - z[inside]) < _LARGEST_SHIFT).any())
 
 
 def _surface(view: MeasuredView) -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,7 @@ def against_container(
         T_world_object: (k, 4, 4) metres.
         rotations: (r, 4, 4) ``T_object_rotated``.
         points: (p, 3) object frame, metres.
-        tray: the walls; the floor is at z = 0.
+        tray: the walls, none of height 0; the floor is at z = 0.
         scale: factor on lengths, see :func:`.fusion_scale`.
 
     Returns:
@@ -36,7 +36,7 @@ def against_container(
         3 mm of these; the farthest is negative inside. All are 0 without points.
     """
     result = np.zeros((len(T_world_object), len(rotations), 5))
-    half_x, half_y, count = 0.5 * tray.width, 0.5 * tray.depth, len(points)
+    half_x, half_y, count, has_walls = 0.5 * tray.width, 0.5 * tray.depth, len(points), tray.wall_height > 0
     for k in range(len(T_world_object)):
         for r in range(len(rotations)):
             T, row = T_world_object[k] @ rotations[r], result[k, r]
@@ -46,7 +46,7 @@ def against_container(
                 x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
                 y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
                 z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-                beyond = max(abs(x) - half_x, abs(y) - half_y) if z < tray.wall_height else -1.0
+                beyond = max(abs(x) - half_x, abs(y) - half_y) if z < tray.wall_height and has_walls else -1.0
                 row[0] += z < -scale * _INTO_CONTAINER
                 row[1] = min(row[1], z / scale)
                 row[2] += beyond > scale * _INTO_CONTAINER

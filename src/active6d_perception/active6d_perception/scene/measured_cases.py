@@ -92,8 +92,11 @@ def _count_body(
             ny = P[1, 0] * d + P[1, 1] * e + P[1, 2] * f
             nz = P[2, 0] * d + P[2, 1] * e + P[2, 2] * f
             u, v = int(np.rint(x / z * view.fx + view.cx)), int(np.rint(y / z * view.fy + view.cy))
-            what, whose = NOT_MEASURED, 2
+            # Outside of the image, a sample beside the camera would count without limit by its depth alone.
+            what, whose, distance = NOT_MEASURED, 2, np.sqrt(x * x + y * y + z * z)
+            squared = distance * distance
             if 0 <= u < width and 0 <= v < height:
+                squared = z * z
                 behind = z - view.depth[v, u]
                 if abs(behind) <= scale * _NEAR:
                     normal = view.normals[v, u]
@@ -107,5 +110,5 @@ def _count_body(
                 if index >= 0:
                     whose = 0 if own[index] else 1
             # A sample that is seen at a slant covers fewer pixels.
-            slant = abs(nx * x + ny * y + nz * z) / np.sqrt(x * x + y * y + z * z)
-            counts[r, what * WHOSE + whose] += int(np.rint(area * slant / (z * z)))
+            slant = abs(nx * x + ny * y + nz * z) / distance
+            counts[r, what * WHOSE + whose] += int(np.rint(area * slant / squared))
