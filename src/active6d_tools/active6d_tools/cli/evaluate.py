@@ -138,12 +138,15 @@ def _evaluate_recorded(
             write_file(path, bop_csv(written, model, evaluation.object_id))
             left_out = f"; {others} episodes that ended at an image of another one are not in it" if others else ""
             warn(f"wrote {path}{left_out}")
+    if csv is not None and evaluation.numbering:
+        warn(evaluation.numbering)
     summary = summarise(results, object_name, settings["steps"], settings["seed"])
     _print_policies(summary)
     episodes = {name: {key: own.measures[key].tolist() for key in own.measures} for name, own in results.items()}
     images = {name: own.views.tolist() for name, own in results.items()}
+    scenes = [scene.recording.folder.name for scene in evaluation.scenes]
     more = {"bop": str(folder), "parameters": parameters, "measures": episodes, "views": images}
-    write_json(json_file, {**summary, **settings, "starts": evaluation.starts.tolist(), **more})
+    write_json(json_file, {**summary, **settings, "starts": evaluation.start_images, "scene_folders": scenes, **more})
 
 
 def _print_policies(summary: dict[str, Any]) -> None:
