@@ -137,6 +137,8 @@ def test_the_results_file_scores_the_same_by_an_independent_calculation(dataset,
     assert summary["policies"]["random"]["e_add_mm"] == pytest.approx(error, rel=0.03)
     (views,) = summary["views"]["random"]
     assert len(set(views)) == 4
+    assert summary["starts"] == [[0, views[0]]]
+    assert summary["scene_folders"] == ["000003"]
     assert summary["policies"]["random"]["detection_rate_ci95_scenes"] is None, "there is one scene"
 
 
@@ -314,6 +316,8 @@ def test_an_object_without_a_visible_label_is_no_wrong_one_to_find():
     assert (found, rate, confirmed, wrong) == (1.0, 1.0, 3, 1)
     assert error == pytest.approx(0.0, abs=0.06)
     assert taken == [8, -1], "BOP's image numbers"
+    evaluation.starts = np.array([[0, 1]])
+    assert evaluation.start_images == [(0, 8)]
 
 
 class LookedAt:
@@ -526,9 +530,11 @@ def test_a_world_in_the_first_cameras_frame_is_turned_upright(dataset, tmp_path)
     assert "000003: the world's z axis is not up; up is taken to be the normal of the largest plane" in told[0]
     relative = invert(placed.T_world_camera[0]) @ placed.T_world_camera
     np.testing.assert_allclose(relative, first @ scene.T_world_camera, atol=1e-6)
-    # The true heights of the cameras over the floor, whose plane is measured.
+    # The true directions and heights of the cameras over the floor, whose plane is measured.
     up = placed.T_world_camera[:, 2, :3] - scene.T_world_camera[:, 2, :3]
     assert np.abs(up).max() < 0.05
+    heights = find_bin(placed, MODEL)[:, 2, 3] - [SPHERE.positions[index][2] for index in VIEWS]
+    assert np.abs(heights).max() < 0.03
 
 
 def test_an_image_is_tried_again_only_among_more_objects(dataset, monkeypatch):
