@@ -537,6 +537,18 @@ def test_a_world_in_the_first_cameras_frame_is_turned_upright(dataset, tmp_path)
     assert np.abs(heights).max() < 0.03
 
 
+def test_up_needs_depth_in_the_first_image(dataset, tmp_path):
+    """Where a camera looks up in a world, a plane has to tell what is up."""
+    scene = BopScene.load(dataset / "test" / "000003")
+    turned = make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    upside_down = replace(scene, T_world_camera=turned @ scene.T_world_camera)
+    depth = tmp_path / "000003"
+    shutil.copytree(scene.folder, depth)
+    Image.fromarray(np.zeros((CAMERA.height, CAMERA.width), np.uint16)).save(depth / "depth" / "000000.png")
+    with pytest.raises(ValueError, match="000003: image 0 has no depth for the plane that tells what is up"):
+        _place(replace(upside_down, folder=depth), MODEL, pytest.fail, lambda text: None)
+
+
 def test_an_image_is_tried_again_only_among_more_objects(dataset, monkeypatch):
     T, rng = BopScene.load(dataset / "test" / "000003").T_world_camera[:4], np.random.default_rng(3)
     seen = seen_by(T, load_scene("mug", "test", 1).T_world_object, rng, off=0.001)

@@ -101,7 +101,8 @@ class RecordedEvaluation:
         self.scenes: list[RecordedScene] = []
         every = [BopScene.load(folder, needs_poses=False) for folder in folders]
         self.object_id, recordings = _choose(every, object_id, warn)
-        self._numbers, self.numbering = number_scenes([recording.folder for recording in recordings])
+        numbers, self.numbering = number_scenes([recording.folder for recording in every])
+        self._numbers = [number for number, recording in zip(numbers, every, strict=True) if recording in recordings]
         if text := differs_from_data_set(recordings[0].folder, self.object_id, model):
             warn(text)
         for recording in recordings:
@@ -303,9 +304,16 @@ def _align(views: Sequence[PerceivedView], poses: np.ndarray, model: ObjectModel
 
 
 def _largest_plane(recording: BopScene) -> tuple[np.ndarray, np.ndarray]:
-    """Normal towards the camera, and a point, of the largest plane in the first image, which is taken for the table."""
+    """Normal towards the camera, and a point, of the largest plane in the first image, which is taken for the table.
+
+    Raises:
+        ValueError: the image has no depth.
+    """
     view = recording.view(0, 0)
     points = backproject(view.depth, view.camera)[np.isfinite(view.depth)][::5].astype(float)
+    if len(points) < 3:
+        where = f"{recording.folder}: image {recording.image_ids[0]}"
+        raise ValueError(f"{where} has no depth for the plane that tells what is up; remove it from {CAMERA_FILE}")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     o3d.utility.random.seed(0)
     (*normal, offset), _ = cloud.segment_plane(0.004, 3, 1000)

@@ -125,7 +125,8 @@ class RecordedScene:
             found, visible = np.concatenate([found, poses[~again]]), np.concatenate([visible, shown[~again]])
             most = max(most, len(poses))
         if not visible.any():
-            raise ValueError(f"{self.recording.folder}: no ground truth of object {self._object_id or self.model.name}")
+            what = f"object {self._object_id or self.model.name} that is visible by a tenth in an image that is used"
+            raise ValueError(f"{self.recording.folder}: no ground truth of {what}")
         name = self.recording.folder.name
         if turned:
             warn(f"{name}: {turned} labels are where an earlier image has an object in another pose; the first counts")
