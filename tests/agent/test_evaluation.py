@@ -180,6 +180,19 @@ def test_an_interval_stays_within_the_values():
     assert (low, high) == (0.5, 1.0)
 
 
+def test_one_scene_has_no_interval_over_scenes():
+    """However far apart two policies are in one scene, that says nothing of other scenes."""
+    own = {"e_add_mm": np.array([1.0, 2.0, 3.0]), "confirmed": np.full(3, 4.0), "wrong": np.array([0.0, 1.0, 2.0])}
+    other = {name: values + 5.0 for name, values in own.items()}
+    row = evaluation.describe(own, evaluation.Intervals(np.full(3, 7)), other)
+    for name in own:
+        assert row[f"{name}_ci95_scenes"] is None
+    assert row["e_add_mm_ci95"][0] < row["e_add_mm"] < row["e_add_mm_ci95"][1]
+    told = row["against_first"]["e_add_mm"]
+    assert (told["mean"], told["ci95_scenes"]) == (-5.0, None)
+    assert (told["excludes_zero"], told["excludes_zero_scenes"]) == (True, False)
+
+
 def test_the_table_pairs_policies_and_says_how_much_of_the_gap_is_closed(lookup, starts):
     names = ["single-view", "random", "max-distance", "oracle"]
     results = dict(evaluation.evaluate(lookup, names, 3, starts))

@@ -162,15 +162,29 @@ def test_bad_camera_keys_are_named(folder, key, value):
         ("scene_camera.json", lambda c: c.update({"0": 5}), "image 0: no key"),
         ("scene_gt.json", lambda c: c["1"][2].pop("obj_id"), r"scene_gt\.json: image 1: no key obj_id"),
         ("scene_gt.json", lambda c: c["1"][2].update(cam_R_m2c=[2.0] * 9), "cam_R_m2c is not a rotation"),
-        ("scene_gt.json", lambda c: c.pop("1"), r"scene_gt\.json: image 1: no list of objects"),
+        ("scene_gt.json", lambda c: c.update({"1": {}}), r"scene_gt\.json: image 1: no list of objects"),
         ("scene_gt_info.json", lambda c: c["1"].pop(), r"info\.json: image 1: 3 objects, scene_gt\.json has 4"),
-        ("scene_gt_info.json", lambda c: c["1"][0].clear(), "image 1: no key visib_fract"),
+        ("scene_gt_info.json", lambda c: c["1"].__setitem__(0, 0.5), "image 1: no key visib_fract"),
+        ("scene_gt_info.json", lambda c: c["1"][0].update(visib_fract="x"), "image 1: visib_fract must be 1 numbers"),
+        ("scene_gt_info.json", lambda c: c.update({"1": 3}), r"info\.json: image 1: no list of objects"),
     ],
 )
 def test_broken_entries_are_named(folder, name, change, message):
     spoil(folder, name, change)
     with pytest.raises(ValueError, match=message):
         BopScene.load(folder)
+
+
+def test_what_is_not_labelled_is_no_error(folder):
+    """Images without labels, and objects without a visible fraction, occur in published data sets."""
+    spoil(folder, "scene_gt.json", lambda c: c.pop("1"))
+    spoil(folder, "scene_gt_info.json", lambda c: (c["0"][2].pop("visib_fract"), c.pop("2")))
+    first, second, third = BopScene.load(folder).truth
+    np.testing.assert_allclose(first.visible_fraction, [*VISIBLE[0, :2], np.nan, VISIBLE[0, 3]])
+    assert second.object_id.shape == (0,)
+    assert second.T_camera_object.shape == (0, 4, 4)
+    assert np.isnan(third.visible_fraction).all()
+    assert len(third.object_id) == 4
 
 
 def test_a_part_of_a_larger_image_is_read(folder):
@@ -182,7 +196,23 @@ def test_a_world_at_the_first_camera_is_read_where_no_poses_are_needed(folder):
     spoil(folder, "scene_camera.json", lambda c: c["0"].update(cam_t_w2c=[0, 0, 0]))
     with pytest.raises(ValueError, match="puts the camera at"):
         BopScene.load(folder)
-    assert len(BopScene.load(folder, needs_poses=False)) == len(EYES)
+    assert BopScene.load(folder, needs_poses=False).has_pose.all()
+
+
+def test_whether_an_image_has_a_pose_is_recorded(folder):
+    """An identity can be a pose: a world may be the first camera's frame."""
+    identity = {"cam_R_w2c": np.eye(3).ravel().tolist(), "cam_t_w2c": [0, 0, 0]}
+
+    def change(content):
+        content["0"].update(identity)
+        for key in identity:
+            content["1"].pop(key)
+
+    spoil(folder, "scene_camera.json", change)
+    scene = BopScene.load(folder, needs_poses=False)
+    np.testing.assert_array_equal(scene.has_pose, [True, False, True])
+    np.testing.assert_array_equal(scene.T_world_camera[:2], [np.eye(4)] * 2)
+    np.testing.assert_array_equal(scene.take([1, 2]).has_pose, [False, True])
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\udcff", "[" * 100_000])

@@ -3,18 +3,25 @@
 import csv
 import json
 import shutil
+import weakref
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hand_made_scenes import CAMERA
 from PIL import Image
 from typer.testing import CliRunner
 
+from active6d_core.camera import View
+from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.view_sphere import ViewSphere
 from active6d_sim.datasets.bop import write_bop_scene
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import load_scene
 from active6d_tools.cli import app
+from active6d_tools.cli.estimate import _draw_each
+from active6d_tools.image_estimation import ImageResult
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +112,24 @@ def test_an_image_that_cannot_be_used_is_left_out_and_told(scene, tmp_path):
     (reason,) = json.loads(told.read_text())["left_out"]
     assert reason.startswith("image 0 is left out: depth has no valid pixel")
     assert reason in " ".join(run.stderr.split())
+
+
+def test_images_are_not_kept(tmp_path):
+    """A scene can have thousands: of each, its poses and scores stay, not its view and masks."""
+    alive, views = [], weakref.WeakSet()
+
+    def found():
+        for number in range(6):
+            alive.append(len(views))
+            view = View(number, np.zeros((12, 16, 3), np.uint8), np.ones((12, 16), np.float32), CAMERA, np.eye(4))
+            views.add(view)
+            T, nothing = np.eye(4)[None], np.zeros((12, 16), np.uint16)
+            one = Hypotheses(T, np.array([0.7]), np.zeros((1, 4)), np.ones(1), np.ones(1, np.uint16), nothing)
+            yield ImageResult(3, number, view, one, 0.5)
+
+    overlay = SimpleNamespace(draw=lambda view, shown: Image.fromarray(view.color))
+    results = _draw_each(found(), 6, overlay, tmp_path, 0.5)
+    told = [(each.image_id, each.score.tolist(), each.seconds) for each in results]
+    assert told == [(number, [0.7], 0.5) for number in range(6)]
+    assert max(alive) <= 2
+    assert len(list(tmp_path.glob("*.png"))) == 6

@@ -5,6 +5,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,17 +21,18 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, rotation_angle
 from active6d_perception.estimators.registry import register_estimator
-from active6d_sim.datasets.bop import BopScene, write_bop_scene
+from active6d_sim.datasets.bop import BopScene, ImageTruth, write_bop_scene
 from active6d_sim.datasets.bop_export import write_model
 from active6d_sim.datasets.bop_models import differs_from_data_set
 from active6d_sim.rendering.active_stereo import ActiveStereo
 from active6d_sim.rendering.simulator import Simulator
 from active6d_sim.scenes.scene_store import load_scene
-from active6d_tools.bop_results import BopEstimates, once_per_image
+from active6d_tools.bop_results import BopEstimates, number_scenes, once_per_image
 from active6d_tools.cli import app
 from active6d_tools.direct_episode import Perception
-from active6d_tools.recorded_scene import RecordedScene, find_bin, turn_boxes
-from active6d_tools.view_registration import register_views
+from active6d_tools.recorded_evaluation import RecordedEvaluation, _choose, _place, _reasons
+from active6d_tools.recorded_scene import RecordedScene, TrueObjects, find_bin, looks_down, turn_boxes
+from active6d_tools.view_registration import _Placing, register_views
 
 CAMERA = PinholeCamera.from_field_of_view(160, 120, 60.0)
 VIEWS = (21, 26, 33, 41, 45, 48, 52, 57, 63, 70, 78, 90)
@@ -44,11 +46,13 @@ class RecordedTruth:
     """Finds what the image in the first pixel's number shows at least half of, some of it wrong."""
 
     poses: dict[int, np.ndarray] = {}  # noqa: RUF012
+    calls = 0
 
     def __init__(self, model):
         pass
 
     def estimate(self, view):
+        RecordedTruth.calls += 1
         T = self.poses[int(view.color[0, 0, 0])]
         rng = np.random.default_rng(int(view.color[0, 0, 0]))
         T = T @ make_transform(
@@ -133,6 +137,9 @@ def test_the_results_file_scores_the_same_by_an_independent_calculation(dataset,
     assert summary["policies"]["random"]["e_add_mm"] == pytest.approx(error, rel=0.03)
     (views,) = summary["views"]["random"]
     assert len(set(views)) == 4
+    assert summary["starts"] == [[0, views[0]]]
+    assert summary["scene_folders"] == ["000003"]
+    assert summary["policies"]["random"]["detection_rate_ci95_scenes"] is None, "there is one scene"
 
 
 def test_scenes_without_camera_poses_are_placed_by_their_objects(dataset, tmp_path):
@@ -142,8 +149,10 @@ def test_scenes_without_camera_poses_are_placed_by_their_objects(dataset, tmp_pa
     show_something_else(copy / "rgb" / "000005.png")
     bare = {key: {k: v for k, v in entry.items() if not k.endswith("w2c")} for key, entry in entries.items()}
     (copy / "scene_camera.json").write_text(json.dumps(bare))
+    RecordedTruth.calls = 0
     result = run("--bop", copy, "--policies", "random", "--steps", 3, "--starts", 1, "--json", tmp_path / "told.json")
     assert result.exit_code == 0, result.output
+    assert RecordedTruth.calls == 12, "images are estimated once"
     words = " ".join(result.output.split())
     assert "11 images are placed by the objects in them" in words
     assert "1 of 12 images cannot be placed and are left out: image 5: at most" in words
@@ -238,7 +247,77 @@ def test_the_bin_is_where_the_cameras_look(dataset):
     assert np.abs(T[:, 2, 3] - expected[:, 2]).max() < 0.003
     recorded = RecordedScene(scene, MODEL, None, Perception(MODEL, "recorded-truth"), T)
     assert recorded.sphere.radius == pytest.approx(0.8, abs=0.02)
-    assert len(recorded.truth()) == len(load_scene("mug", "test", 1))
+    truth = recorded.truth(pytest.fail)
+    assert len(truth.T_bin_object) == len(load_scene("mug", "test", 1))
+    most = np.max([image.visible_fraction for image in scene.truth], axis=0)
+    np.testing.assert_array_equal(truth.visible, most >= 0.1)
+
+
+CUP = load_object("coffee_cup")
+
+
+def labelled(images, *, shown=1.0):
+    """The true objects of a scene whose images list these poses in the first camera's frame, and the warnings."""
+    truth = [
+        ImageTruth(np.ones(len(T), int), CUP.T_camera_mesh(T), np.full(len(T), fraction))
+        for T, fraction in zip(images, np.broadcast_to(shown, len(images)), strict=True)
+    ]
+    scene, told = RecordedScene.__new__(RecordedScene), []
+    scene.recording = SimpleNamespace(truth=truth, folder=Path("labelled"))
+    scene.model, scene.T_bin_camera, scene._object_id = CUP, np.tile(np.eye(4), (len(images), 1, 1)), 1
+    return scene.truth(told.append), told
+
+
+def stacked(*heights, tilt=0.0):
+    R = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+    return make_transform(np.tile(R, (len(heights), 1, 1)), np.array([[0.0, 0.0, each] for each in heights]))
+
+
+@pytest.mark.parametrize("apart", [0.010, 0.020, 0.030])
+def test_nested_cups_stay_as_many_as_they_are(apart):
+    """Labels are off by a third of their distance, and images list them in another order."""
+    cups = apart * np.arange(3)
+    images = [stacked(*cups), stacked(*(cups + apart / 3)[::-1]), stacked(*(cups - apart / 3)[[1, 2, 0]])]
+    truth, told = labelled(images)
+    np.testing.assert_allclose(truth.T_bin_object, images[0], atol=1e-9)
+    assert not told
+
+
+def test_one_object_in_several_poses_counts_once():
+    """A label that is upside down is no second cup; a cup beside it is."""
+    upside_down = stacked(0.004, tilt=180.0)
+    truth, told = labelled([stacked(0.0), np.concatenate([upside_down, stacked(0.3)]), upside_down], shown=[0, 0, 1])
+    np.testing.assert_allclose(truth.T_bin_object, stacked(0.0, 0.3), atol=1e-9)
+    np.testing.assert_array_equal(truth.visible, [True, False])
+    (text,) = told
+    assert "2 labels are where an earlier image has an object in another pose" in text
+
+
+def test_more_objects_than_an_image_lists_are_told():
+    truth, told = labelled([stacked(0.0), stacked(0.3)])
+    assert len(truth.T_bin_object) == 2
+    assert told == [
+        "labelled: 2 objects in all, but no image lists more than 1: labels are partial, or camera poses disagree"
+    ]
+
+
+def test_an_object_without_a_visible_label_is_no_wrong_one_to_find():
+    """By hand: two cups are confirmed; one is barely visible and need not be found, the other is nowhere."""
+    truth = TrueObjects(stacked(0.0, 0.3), np.array([True, False]))
+    evaluation = RecordedEvaluation.__new__(RecordedEvaluation)
+    evaluation._model, evaluation._steps, evaluation._truths = CUP, 1, [truth]
+    evaluation._fusion = SimpleNamespace(parameters=SimpleNamespace(confirmed=0.5))
+    path = SimpleNamespace(path_length=lambda positions: 0.0)
+    evaluation.scenes = [SimpleNamespace(sphere=path, recording=SimpleNamespace(image_ids=(5, 8)))]
+    objects = SimpleNamespace(T_world_object=stacked(0.0, 0.3, 0.6), probability=np.array([0.9, 0.8, 0.7]))
+    view = SimpleNamespace(view=SimpleNamespace(T_world_camera=np.eye(4)))
+    episode = SimpleNamespace(objects=[objects], views=[view])
+    found, error, _, taken, rate, confirmed, wrong = evaluation._score(0, episode, SimpleNamespace(taken=[1]))
+    assert (found, rate, confirmed, wrong) == (1.0, 1.0, 3, 1)
+    assert error == pytest.approx(0.0, abs=0.06)
+    assert taken == [8, -1], "BOP's image numbers"
+    evaluation.starts = np.array([[0, 1]])
+    assert evaluation.start_images == [(0, 8)]
 
 
 class LookedAt:
@@ -330,6 +409,20 @@ def no_truth(copy):
     return {"scene_gt.json": None, "scene_gt_info.json": None}
 
 
+def few_labels(copy):
+    """Of a recording without camera poses, no image lists five objects."""
+    truth, cameras = (json.loads((copy / f"scene_{name}.json").read_text()) for name in ("gt", "camera"))
+    bare = {image: {k: v for k, v in entry.items() if not k.endswith("w2c")} for image, entry in cameras.items()}
+    few = {image: entries[:4] for image, entries in truth.items()}
+    return {"scene_gt.json": few, "scene_gt_info.json": None, "scene_camera.json": bare}
+
+
+def other_cameras(copy):
+    cameras = json.loads((copy / "scene_camera.json").read_text())
+    (copy / "scene_camera_cam1.json").write_text(json.dumps(cameras))
+    return {"scene_camera.json": None}
+
+
 def wrong_scale(copy):
     cameras = json.loads((copy / "scene_camera.json").read_text())
     return {"scene_camera.json": {image: {**entry, "depth_scale": 10.0} for image, entry in cameras.items()}}
@@ -341,12 +434,16 @@ def wrong_scale(copy):
         (another_object, "has objects 1, 2; choose with --object-id"),
         (no_truth, "policies need ground truth to be scored"),
         (wrong_scale, "would span"),
+        (few_labels, "no image's ground truth lists more than 4 of object 1"),
+        (other_cameras, "it has scene_camera_cam1.json: copy one camera's files to the usual names"),
     ],
 )
 def test_a_scene_that_cannot_be_scored_is_refused_before_it_is_estimated(dataset, tmp_path, change, reason):
+    RecordedTruth.calls = 0
     result = run("--bop", copied(dataset, tmp_path, change), "--policies", "random")
     assert result.exit_code == 2
     assert reason in " ".join(result.output.split())
+    assert RecordedTruth.calls == 0
 
 
 def test_scenes_of_several_splits_are_not_mixed(dataset, tmp_path):
@@ -374,3 +471,110 @@ def test_a_data_set_with_another_mesh_or_frame_is_noticed(dataset, tmp_path):
     moved = replace(MODEL, origin=MODEL.origin + [0.02, 0.0, 0.0])
     assert "their bounds differ by 20 mm" in differs_from_data_set(scene, 1, moved)
     assert differs_from_data_set(tmp_path / "test" / "000001", 1, MODEL) == ""
+
+
+def recordings(*object_ids):
+    """Recordings whose images list these objects; (1, 0.05) is object 1 of which a twentieth is visible."""
+    made = []
+    for number, images in enumerate(object_ids):
+        truth = [
+            ImageTruth(
+                np.array([each[0] for each in image], int),
+                np.tile(np.eye(4), (len(image), 1, 1)),
+                np.array([each[1] for each in image], float),
+            )
+            for image in images
+        ]
+        made.append(SimpleNamespace(truth=truth, folder=Path("split") / f"scene{number}"))
+    return made
+
+
+def test_scenes_of_different_objects_are_not_scored_as_one():
+    first, second, nothing = recordings([[(1, 1.0)]], [[(2, 1.0)], [(3, np.nan)]], [[(2, 0.05)], []])
+    told = []
+    with pytest.raises(ValueError, match=r"^split: has objects 1, 2, 3; choose with --object-id"):
+        _choose([first, second, nothing], None, told.append)
+    assert _choose([first, second, nothing], 3, told.append) == (3, [second])
+    assert told == ["2 of 3 scenes have no object 3 that is visible by a tenth and are left out: scene0, scene2"]
+    with pytest.raises(ValueError, match=r"no ground truth of object 7, only of \[1, 2, 3\]"):
+        _choose([first, second, nothing], 7, told.append)
+    with pytest.raises(ValueError, match="object 2, or none that is visible by a tenth"):
+        _choose([nothing], None, told.append)
+    assert _choose([first, first], None, pytest.fail) == (1, [first, first])
+
+
+def test_images_without_a_sure_object_are_refused_with_the_cause(dataset):
+    scene = BopScene.load(dataset / "test" / "000003")
+    bare = replace(scene, has_pose=np.full(len(scene), False))
+    unsure = SimpleNamespace(T_camera_object=np.tile(np.eye(4), (2, 1, 1)), score=np.array([0.4, 0.1]))
+    with pytest.raises(ValueError, match=r"000003: no object with a score of 0\.5 or more in any image; is --object"):
+        _place(bare, MODEL, lambda view: SimpleNamespace(hypotheses=unsure), pytest.fail)
+
+
+def test_a_world_in_the_first_cameras_frame_is_turned_upright(dataset, tmp_path):
+    """Its poses are poses, the identity too, and the table's normal takes the place of its z axis."""
+    scene = BopScene.load(dataset / "test" / "000003")
+    cameras = json.loads((scene.folder / "scene_camera.json").read_text())
+    first = invert(scene.T_world_camera[0])
+    for image, T in zip(cameras.values(), scene.T_world_camera, strict=True):
+        T_camera_world = invert(first @ T)
+        image["cam_R_w2c"] = T_camera_world[:3, :3].ravel().tolist()
+        image["cam_t_w2c"] = (1e3 * T_camera_world[:3, 3]).tolist()
+    copy = copied(dataset, tmp_path, lambda copy: {"scene_camera.json": cameras})
+    recording = BopScene.load(copy, needs_poses=False)
+    np.testing.assert_allclose(recording.T_world_camera[0], np.eye(4), atol=1e-9)
+    assert not looks_down(recording.T_world_camera)
+    told = []
+    placed, seen = _place(recording, MODEL, lambda view: pytest.fail("poses are known"), told.append)
+    assert seen is None
+    assert "000003: the world's z axis is not up; up is taken to be the normal of the largest plane" in told[0]
+    relative = invert(placed.T_world_camera[0]) @ placed.T_world_camera
+    np.testing.assert_allclose(relative, first @ scene.T_world_camera, atol=1e-6)
+    # The true directions and heights of the cameras over the floor, whose plane is measured.
+    up = placed.T_world_camera[:, 2, :3] - scene.T_world_camera[:, 2, :3]
+    assert np.abs(up).max() < 0.05
+    heights = find_bin(placed, MODEL)[:, 2, 3] - [SPHERE.positions[index][2] for index in VIEWS]
+    assert np.abs(heights).max() < 0.03
+
+
+def test_up_needs_depth_in_the_first_image(dataset, tmp_path):
+    """Where a camera looks up in a world, a plane has to tell what is up."""
+    scene = BopScene.load(dataset / "test" / "000003")
+    turned = make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    upside_down = replace(scene, T_world_camera=turned @ scene.T_world_camera)
+    depth = tmp_path / "000003"
+    shutil.copytree(scene.folder, depth)
+    Image.fromarray(np.zeros((CAMERA.height, CAMERA.width), np.uint16)).save(depth / "depth" / "000000.png")
+    with pytest.raises(ValueError, match="000003: image 0 has no depth for the plane that tells what is up"):
+        _place(replace(upside_down, folder=depth), MODEL, pytest.fail, lambda text: None)
+
+
+def test_an_image_is_tried_again_only_among_more_objects(dataset, monkeypatch):
+    T, rng = BopScene.load(dataset / "test" / "000003").T_world_camera[:4], np.random.default_rng(3)
+    seen = seen_by(T, load_scene("mug", "test", 1).T_world_object, rng, off=0.001)
+    strangers = [make_transform(Rotation.random(6, rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, (6, 3))) for _ in "abc"]
+    tries = []
+
+    def place(self, a, b, rng):
+        index = next(index for index, each in enumerate(every) if each is b)
+        tries.append((index, len(a)))
+        return (invert(T[0]) @ T[index - 3], "") if index >= 3 else (None, "no")
+
+    every = [*strangers, *seen]
+    monkeypatch.setattr(_Placing, "place", place)
+    placed, left_out = register_views(every, MODEL)
+    assert (sorted(placed), sorted(left_out)) == ([3, 4, 5, 6], [0, 1, 2])
+    assert len(set(tries)) == len(tries), "the same image among the same objects"
+    assert [index for index, _ in tries[:6]] == [0, 1, 2, 4, 5, 6]
+
+
+def test_reasons_are_told_of_the_first_images():
+    assert _reasons({4: "a", 7: "b"}) == "image 4: a; image 7: b"
+    assert _reasons(dict.fromkeys(range(20), "no")) == "image 0: no; image 1: no; image 2: no; and 17 more"
+
+
+def test_scenes_without_numbers_are_numbered_by_their_order():
+    assert number_scenes([Path("x/000004"), Path("x/000012")]) == ([4, 12], "")
+    numbers, text = number_scenes([Path("x/000004"), Path("x/left"), Path("x/right")])
+    assert numbers == [0, 1, 2]
+    assert text.endswith("0 is 000004, 1 is left, 2 is right")

@@ -1,6 +1,7 @@
 """docs/results.md says what its files say, and marks say what intervals say."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from hypothesis import strategies as st
 from active6d_agent.environment.rollout import EpisodeResults
 from active6d_agent.evaluation.policy_evaluation import Intervals, describe, summarise
 from active6d_tools.cli import app
+from active6d_tools.cli.evaluate import _print_differences, _print_policies
+from active6d_tools.report.ablation_plots import ablation_panels
 from active6d_tools.results import goals as goals
 from active6d_tools.results import page as page
 from active6d_tools.results import tables as tables
@@ -80,6 +83,28 @@ def test_table_1_tells_how_many_confirmed_objects_are_wrong(evaluated):
         row |= {key: value, f"{key}_ci95_scenes": [value - 0.01, value + 0.01]}
     cells = rows_of(tables.policies_table(evaluated))["`random`"]
     assert cells[3:5] == [".610 (.600 to .620)", ".025 (.015 to .035)"]
+
+
+def test_one_scene_leaves_no_interval_over_scenes(capsys):
+    """Tables, goals and plots do without it, and no difference is sure beyond the scene."""
+    made = {"view-attention": results(0.8, 12.0, 3.0), "random": results(0.7, 14.0, 4.0, seed=1)}
+    one = {name: replace(own, scene=np.zeros(len(SCENE), int)) for name, own in made.items()}
+    summary = summarise(one, "mug", 5)
+    assert rows_of(tables.policies_table(summary))["`random`"][1].endswith(" -")
+    assert rows_of(tables.differences_table(summary, "view-attention"))["`random`"][0].startswith("(✓) +.1")
+    _print_policies(summary)
+    _print_differences(summary)
+    printed = capsys.readouterr().out
+    assert re.search(r"random +4\.00 +14\.\d+ +- +0\.\d+ +- ", printed)
+    assert re.search(r"random +-1\.00 +-\d\.\d+ +- +\+0\.\d+ +-", printed)
+    verdict = goals.beats(summary, "view-attention", ["random"], ["detection_rate"])
+    assert (verdict.met, verdict.caveat) == (True, "over starts, not over scenes")
+    row = {"variant": "own", "policy": "random", "noise": "own", **summary["policies"]["random"]}
+    row |= {"gap_closed": 0.5, "gap_closed_ci95_scenes": None}
+    for panel in ablation_panels("variants", [row]):
+        ((_, values),) = panel.lines.values()
+        assert len(values) == 1
+    assert rows_of(tables.noise_resampling_table({"mug": {"rows": [row]}}))["`random`, own noise"][0].endswith("50 %")
 
 
 def test_a_loss_is_as_visible_as_a_win(evaluated):

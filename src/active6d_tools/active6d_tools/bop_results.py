@@ -2,8 +2,9 @@
 
 import csv
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -30,6 +31,20 @@ class BopEstimates:
     T_camera_object: np.ndarray
     score: np.ndarray
     seconds: float
+
+
+def number_scenes(folders: Sequence[Path]) -> tuple[list[int], str]:
+    """BOP's numbers of scenes by the names of their folders, and what to say of them.
+
+    Where names are no numbers, or not different ones, all folders are numbered by their order, from 0, and the text
+    says so; else it is empty.
+    """
+    names = [folder.resolve().name for folder in folders]
+    numbers = [int(name) if name.isdecimal() else -1 for name in names]
+    if min(numbers) >= 0 and len(set(numbers)) == len(numbers):
+        return numbers, ""
+    ordered = ", ".join(f"{number} is {name}" for number, name in enumerate(names))
+    return list(range(len(names))), f"scene folders without a number are numbered by their order: {ordered}"
 
 
 def once_per_image(estimates: Iterable[BopEstimates]) -> tuple[list[BopEstimates], int]:

@@ -19,7 +19,7 @@ from active6d_core.rgbd import make_view
 from active6d_core.structured_text import read_json
 from active6d_perception.active6d import Active6D
 from active6d_sim.datasets.bop import BopScene
-from active6d_tools.bop_results import BopEstimates
+from active6d_tools.bop_results import BopEstimates, number_scenes
 from active6d_tools.report.drawing import ScoreScale
 from active6d_tools.report.silhouette import SilhouetteDrawer
 
@@ -53,18 +53,18 @@ class ImageResult:
 NumberedImage = tuple[int, Callable[[], View]]
 
 
-def read_scene(folder: Path, needs_poses: bool = False) -> tuple[int, list[NumberedImage]]:
-    """The scene's number and the numbered views of a BOP scene folder, with or without camera poses.
+def read_scene(folder: Path, needs_poses: bool = False) -> tuple[int, str, list[NumberedImage]]:
+    """A BOP scene folder, with or without camera poses: its number, what to say of that, and its numbered views.
 
     Raises:
         ValueError: the folder is no BOP scene; the message names the file.
     """
     scene = BopScene.load(folder, needs_poses)
-    name = folder.resolve().name
+    (number,), numbering = number_scenes([folder])
     images: list[NumberedImage] = [
         (image, partial(scene.view, index, 0)) for index, image in enumerate(scene.image_ids)
     ]
-    return int(name) if name.isdecimal() else 0, images
+    return number, numbering, images
 
 
 def read_image(rgb: Path, depth: Path, intrinsics: Path, depth_scale: float | None) -> View:
@@ -137,7 +137,7 @@ def estimate_images(
         raise ValueError(first_problem)
 
 
-def describe(results: Sequence[ImageResult], model: ObjectModel) -> list[dict[str, Any]]:
+def describe(results: Sequence[BopEstimates], model: ObjectModel) -> list[dict[str, Any]]:
     """Results as JSON rows, one per image."""
     return [
         {
@@ -145,9 +145,7 @@ def describe(results: Sequence[ImageResult], model: ObjectModel) -> list[dict[st
             "seconds": result.seconds,
             "hypotheses": [
                 {"score": float(score), "T_camera_mesh": T.tolist()}
-                for T, score in zip(
-                    model.T_camera_mesh(result.hypotheses.T_camera_object), result.hypotheses.score, strict=True
-                )
+                for T, score in zip(model.T_camera_mesh(result.T_camera_object), result.score, strict=True)
             ],
         }
         for result in results

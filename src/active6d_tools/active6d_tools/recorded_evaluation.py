@@ -23,15 +23,18 @@ from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.camera_alignment import CameraAlignment
 from active6d_perception.scene.expected_visibility import OPEN_TABLE
 from active6d_perception.scene.measured_view import measure_view
-from active6d_sim.datasets.bop import CAMERA_FILE, TRUTH_FILE, BopScene
+from active6d_sim.datasets.bop import CAMERA_FILE, TRUTH_FILE, BopScene, describe_cameras
 from active6d_sim.datasets.bop_models import differs_from_data_set
-from active6d_tools.bop_results import BopEstimates
+from active6d_sim.physics.heap import VISIBILITY_THRESHOLD
+from active6d_tools.bop_results import BopEstimates, number_scenes
 from active6d_tools.direct_episode import DirectEpisode, DirectRunner, PerceivedView, Perception
-from active6d_tools.recorded_scene import RecordedCamera, RecordedScene, find_bin
-from active6d_tools.view_registration import register_views, upright
+from active6d_tools.recorded_scene import RecordedCamera, RecordedScene, find_bin, looks_down, of_object
+from active6d_tools.view_registration import FEWEST_SHARED, register_views, upright
 
 #: Objects that are less certain do not help to place an image.
 _SURE = 0.5
+#: A message names so many images.
+_NAMED = 3
 OnProgress = Callable[[str, int, int], None]
 
 
@@ -49,6 +52,10 @@ def scene_folders(folder: Path) -> list[Path]:
             raise ValueError(f"{folder}: has scenes in {names}; name one of these folders")
         if found:
             return found
+    for depth in ("", "*/", "*/*/"):
+        if several := sorted(folder.glob(f"{depth}{Path(CAMERA_FILE).stem}_*.json")):
+            scene = several[0].parent
+            raise ValueError(f"{scene / CAMERA_FILE}: no such file{describe_cameras(scene)}")
     raise ValueError(f"{folder}: no {CAMERA_FILE} in it or in its subfolders; it must be a data set in BOP's format")
 
 
@@ -65,8 +72,14 @@ class RecordedEvaluation:
         seed: of first views and policies.
         warn: called with what a user should know of a scene.
 
+    Attributes:
+        scenes: those that have the object.
+        object_id: BOP's number of the object.
+        numbering: what to say of the scenes' numbers in results files; empty if these are their names.
+        starts: (E, 2) index of the scene, and of the first view in it.
+
     Raises:
-        ValueError: a scene cannot be read, placed or scored; the message names it.
+        ValueError: a scene cannot be read, placed or scored, or none has the object; the message names it.
     """
 
     def __init__(
@@ -86,16 +99,19 @@ class RecordedEvaluation:
         self._fusion = AllViewsFusion(model, tray=OPEN_TABLE)
         perception = Perception(model, estimator)
         self.scenes: list[RecordedScene] = []
-        #: BOP's number of the object.
-        self.object_id = object_id or 1
-        for folder in folders:
-            recording = BopScene.load(folder, needs_poses=False)
-            self.object_id = _check(recording, model, object_id)
-            if not self.scenes and (text := differs_from_data_set(folder, self.object_id, model)):
-                warn(text)
-            placed = _place(recording, model, perception, warn)
-            self.scenes.append(RecordedScene(placed, model, object_id, perception, find_bin(placed, model, warn)))
-        self._truths = [scene.truth() for scene in self.scenes]
+        every = [BopScene.load(folder, needs_poses=False) for folder in folders]
+        self.object_id, recordings = _choose(every, object_id, warn)
+        numbers, self.numbering = number_scenes([recording.folder for recording in every])
+        self._numbers = [number for number, recording in zip(numbers, every, strict=True) if recording in recordings]
+        if text := differs_from_data_set(recordings[0].folder, self.object_id, model):
+            warn(text)
+        for recording in recordings:
+            _check(recording, model, self.object_id)
+        for recording in recordings:
+            placed, seen = _place(recording, model, perception, warn)
+            T_bin_camera = find_bin(placed, model, warn)
+            self.scenes.append(RecordedScene(placed, model, self.object_id, perception, T_bin_camera, seen))
+        self._truths = [scene.truth(warn) for scene in self.scenes]
         self.starts = np.array(
             [
                 (number, view)
@@ -103,6 +119,11 @@ class RecordedEvaluation:
                 for view in self._draw(number, np.unique(scene.nearest[scene.allowed]), starts)
             ]
         )
+
+    @property
+    def start_images(self) -> list[tuple[int, int]]:
+        """E times the index of the scene, and BOP's number of the first image in it."""
+        return [(number, self.scenes[number].recording.image_ids[view]) for number, view in self.starts.tolist()]
 
     def _draw(self, number: int, views: np.ndarray, count: int) -> np.ndarray:
         rng = np.random.default_rng([self._seed, number])
@@ -119,7 +140,8 @@ class RecordedEvaluation:
             on_progress: called with a description, the number of episodes done and that of all.
 
         Returns:
-            The scores; and for each episode the objects in the camera of its last image.
+            The scores, with BOP's image numbers as views; and for each episode the objects in the camera of its last
+            image.
         """
         rows, estimates = [], []
         for done, (number, start) in enumerate(self.starts.tolist()):
@@ -132,47 +154,93 @@ class RecordedEvaluation:
             runner = DirectRunner(self._model, limits, self._fusion)
             episode = runner.run(policy, camera, np.random.default_rng([self._seed, number, start]))
             rows.append(self._score(number, episode, camera))
-            estimates.append(_estimates(scene, episode, camera))
+            estimates.append(_estimates(scene, self._numbers[number], episode, camera))
         return EpisodeResults(self.starts[:, 0], *map(np.array, zip(*rows, strict=True))), estimates
 
     def _score(self, number: int, episode: DirectEpisode, camera: RecordedCamera) -> tuple[Any, ...]:
         objects, diameter = episode.objects[-1], self._model.diameter
-        errors = e_add(self._model, objects.T_world_object[:, None], self._truths[number][None], cutoff=MISSED_E_ADD)
+        scene, true = self.scenes[number], self._truths[number]
+        every = e_add(self._model, objects.T_world_object[:, None], true.T_bin_object[None], cutoff=MISSED_E_ADD)
+        errors, sure = every[:, true.visible], objects.probability >= self._fusion.parameters.confirmed
         score = score_errors(errors, diameter)
-        sure = score_confirmed(errors, objects.probability >= self._fusion.parameters.confirmed, diameter)
+        rate, confirmed, _ = score_confirmed(errors, sure, diameter)
+        # An object that no image shows well need not be found, but who finds it is right.
+        _, _, wrong = score_confirmed(every, sure, diameter)
         positions = np.array([seen.view.T_world_camera[:3, 3] for seen in episode.views])
-        taken = camera.taken + [-1] * (self._steps + 1 - len(camera.taken))
-        metres = self.scenes[number].sphere.path_length(positions)
-        return score.detection_rate, score.mean_e_add_mm, metres, taken, *sure
+        taken = [scene.recording.image_ids[view] for view in camera.taken]
+        taken += [-1] * (self._steps + 1 - len(taken))
+        metres = scene.sphere.path_length(positions)
+        return score.detection_rate, score.mean_e_add_mm, metres, taken, rate, confirmed, wrong
 
     def _entropy(self, scene: RecordedScene) -> np.ndarray:
         of_image = {int(i): view_entropy(scene.perceive(int(i)).hypotheses.segmentation) for i in set(scene.nearest)}
         return np.array([of_image[int(i)] for i in scene.nearest])
 
 
-def _check(recording: BopScene, model: ObjectModel, object_id: int | None) -> int:
-    """BOP's number of the object; ValueError where a recording cannot be scored, before its images are estimated."""
-    if recording.truth is None:
-        raise ValueError(f"{recording.folder / TRUTH_FILE}: no such file; policies need ground truth to be scored")
-    known = sorted({int(each) for image in recording.truth for each in image.object_id})
+def _choose(
+    recordings: Sequence[BopScene], object_id: int | None, warn: Callable[[str], None]
+) -> tuple[int, list[BopScene]]:
+    """BOP's number of the object, and the recordings with labels of it that are visible enough; others are reported.
+
+    Raises:
+        ValueError: there is no ground truth, there are several objects to choose from, or no scene has the object.
+    """
+    for recording in recordings:
+        if recording.truth is None:
+            raise ValueError(f"{recording.folder / TRUTH_FILE}: no such file; policies need ground truth to be scored")
+    folder = recordings[0].folder if len(recordings) == 1 else recordings[0].folder.parent
+    labels = [image.object_id for recording in recordings for image in recording.truth or ()]
+    known = np.unique(np.concatenate(labels)).tolist()
+    names = ", ".join(map(str, known))
     if object_id is None and len(known) > 1:
-        raise ValueError(f"{recording.folder}: has objects {', '.join(map(str, known))}; choose with --object-id")
-    if object_id is not None and object_id not in known:
-        raise ValueError(f"{recording.folder}: no ground truth of object {object_id}, only of {known}")
-    view = recording.view(0, 0)
+        raise ValueError(f"{folder}: has objects {names}; choose with --object-id")
+    chosen = object_id or (known[0] if known else 1)
+    kept = [recording for recording in recordings if _shows(recording, chosen)]
+    if not kept:
+        visible = ", or none that is visible by a tenth" if chosen in known else f", only of [{names}]"
+        raise ValueError(f"{folder}: no ground truth of object {chosen}{visible}")
+    if len(kept) < len(recordings):
+        lacking = [recording.folder.name for recording in recordings if not _shows(recording, chosen)]
+        what = f"{len(lacking)} of {len(recordings)} scenes have no object {chosen} that is visible by a tenth"
+        warn(f"{what} and are left out: {', '.join(lacking)}")
+    return chosen, kept
+
+
+def _shows(recording: BopScene, object_id: int) -> bool:
+    """Whether an image has a label of the object that counts."""
+    return any(
+        not fraction < VISIBILITY_THRESHOLD
+        for image in recording.truth or ()
+        for fraction in image.visible_fraction[of_object(image, object_id)]
+    )
+
+
+def _check(recording: BopScene, model: ObjectModel, object_id: int) -> None:
+    """ValueError where images are not of the model or cannot be placed, before they are estimated."""
+    view, folder = recording.view(0, 0), recording.folder
     if np.isfinite(view.depth).any():
         try:
             check_span(model, view.depth, view.camera)
         except ValueError as error:
-            raise ValueError(f"{recording.folder}: {error}") from error
-    return object_id or (known[0] if known else 1)
+            raise ValueError(f"{folder}: {error}") from error
+    missing = np.count_nonzero(~recording.has_pose)
+    if 0 < missing < len(recording):
+        raise ValueError(
+            f"{folder}: {missing} of {len(recording)} images have no camera pose; remove these images from "
+            f"{CAMERA_FILE}, or all poses: then images are placed by the objects in them"
+        )
+    most = max(int(of_object(image, object_id).sum()) for image in recording.truth or ())
+    if missing and len(recording) > 1 and most < FEWEST_SHARED:
+        raise ValueError(
+            f"{folder}: has no camera poses, and images must share {FEWEST_SHARED} objects to be placed by them, but "
+            f"no image's ground truth lists more than {most} of object {object_id}"
+        )
 
 
-def _estimates(scene: RecordedScene, episode: DirectEpisode, camera: RecordedCamera) -> BopEstimates:
+def _estimates(scene: RecordedScene, number: int, episode: DirectEpisode, camera: RecordedCamera) -> BopEstimates:
     objects, index = episode.objects[-1], camera.taken[-1]
-    name = scene.recording.folder.resolve().name
     return BopEstimates(
-        int(name) if name.isdecimal() else 0,
+        number,
         scene.recording.image_ids[index],
         invert(scene.T_bin_camera[index]) @ objects.T_world_object,
         objects.probability,
@@ -180,33 +248,49 @@ def _estimates(scene: RecordedScene, episode: DirectEpisode, camera: RecordedCam
     )
 
 
-def _place(recording: BopScene, model: ObjectModel, perception: Perception, warn: Callable[[str], None]) -> BopScene:
-    """The recording, with camera poses found by the objects in its images where it has none.
+def _place(
+    recording: BopScene, model: ObjectModel, perception: Perception, warn: Callable[[str], None]
+) -> tuple[BopScene, list[PerceivedView] | None]:
+    """The recording in a world with z up, with camera poses found by the objects in its images where it has none.
+
+    Returns:
+        It, without the images that cannot be placed; and what was found in each image, if they had to be estimated.
 
     Raises:
         ValueError: the images cannot be placed.
     """
-    missing = [np.array_equal(T, np.eye(4)) for T in recording.T_world_camera]
-    if not any(missing):
-        return recording
     folder = recording.folder
-    if not all(missing):
-        raise ValueError(
-            f"{folder}: {sum(missing)} of {len(missing)} images have no camera pose; remove these images from "
-            f"{CAMERA_FILE}, or all poses: then images are placed by the objects in them"
-        )
+    if recording.has_pose.all():
+        if looks_down(recording.T_world_camera):
+            return recording, None
+        up = "up is taken to be the normal of the largest plane in the first image"
+        warn(f"{folder.name}: the world's z axis is not up; {up}")
+        T_first_camera = invert(recording.T_world_camera[0]) @ recording.T_world_camera
+        return replace(recording, T_world_camera=upright(T_first_camera, *_largest_plane(recording))), None
     views = [perception(recording.view(index, index + 1)) for index in range(len(recording))]
     sure = [seen.hypotheses.T_camera_object[seen.hypotheses.score >= _SURE] for seen in views]
+    if not any(map(len, sure)):
+        raise ValueError(
+            f"{folder}: no object with a score of {_SURE:g} or more in any image; is --object what the images show, is "
+            f"depth_scale in {CAMERA_FILE} right, and are the objects in the camera's range?"
+        )
     placed, left_out = register_views(sure, model)
-    why = "; ".join(f"image {recording.image_ids[index]}: {reason}" for index, reason in left_out.items())
+    why = _reasons({recording.image_ids[index]: reason for index, reason in left_out.items()})
     if len(placed) < min(2, len(recording)):
         raise ValueError(f"{folder}: has no camera poses, and no two images can be placed by their objects: {why}")
     warn(f"{folder.name}: no camera poses; {len(placed)} images are placed by the objects in them")
     if left_out:
         warn(f"{folder.name}: {len(left_out)} of {len(views)} images cannot be placed and are left out: {why}")
-    recording = recording.take(list(placed))
-    poses = _align([views[index] for index in placed], np.array(list(placed.values())), model)
-    return replace(recording, T_world_camera=upright(poses, *_largest_plane(recording)))
+    recording, views = recording.take(list(placed)), [views[index] for index in placed]
+    poses = _align(views, np.array(list(placed.values())), model)
+    return replace(recording, T_world_camera=upright(poses, *_largest_plane(recording))), views
+
+
+def _reasons(by_image: dict[int, str]) -> str:
+    """Why images are left out: those of the first few, and how many more there are."""
+    texts = [f"image {image}: {reason}" for image, reason in list(by_image.items())[:_NAMED]]
+    more = len(by_image) - len(texts)
+    return "; ".join(texts) + (f"; and {more} more" if more else "")
 
 
 def _align(views: Sequence[PerceivedView], poses: np.ndarray, model: ObjectModel) -> np.ndarray:
@@ -220,9 +304,16 @@ def _align(views: Sequence[PerceivedView], poses: np.ndarray, model: ObjectModel
 
 
 def _largest_plane(recording: BopScene) -> tuple[np.ndarray, np.ndarray]:
-    """Normal towards the camera, and a point, of the largest plane in the first image, which is taken for the table."""
+    """Normal towards the camera, and a point, of the largest plane in the first image, which is taken for the table.
+
+    Raises:
+        ValueError: the image has no depth.
+    """
     view = recording.view(0, 0)
     points = backproject(view.depth, view.camera)[np.isfinite(view.depth)][::5].astype(float)
+    if len(points) < 3:
+        where = f"{recording.folder}: image {recording.image_ids[0]}"
+        raise ValueError(f"{where} has no depth for the plane that tells what is up; remove it from {CAMERA_FILE}")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     o3d.utility.random.seed(0)
     (*normal, offset), _ = cloud.segment_plane(0.004, 3, 1000)

@@ -1,23 +1,26 @@
 """A scene recorded in BOP's format as a camera: each goal selects the nearest view (paper, real experiment)."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from active6d_core.camera import PinholeCamera, backproject
+from active6d_core.metrics import match
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, look_at, make_transform, transform_points
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.symmetric_distance import SymmetricDistance
-from active6d_sim.datasets.bop import BopScene
+from active6d_sim.datasets.bop import BopScene, ImageTruth
 from active6d_sim.physics.heap import VISIBILITY_THRESHOLD
 from active6d_sim.rendering.simulator import NANOSECONDS, GoalError
 from active6d_tools.direct_episode import PerceivedView, Perception
 
 #: A goal is in reach if a recorded view is at most this far from it, radians.
 _REACH = np.radians(20.0)
-#: True poses in different images that are closer than this fraction of the diameter are one object.
+#: Labels of different images can be one object if their middles are closer than this fraction of the diameter. They
+#: disagree if their surfaces are farther apart than that.
 _SAME_OBJECT = 0.25
 #: Optical axes that differ less than this do not tell where they cross, radians.
 _PARALLEL = np.radians(10.0)
@@ -26,6 +29,19 @@ _BELOW_FLOOR = 0.1
 #: Within so many metres, a floor has so many times more points than as much height above it. Under 12 simulated piles,
 #: the floor had .019 to .074 of all points, and heights between the objects .004 to .009.
 _FLOOR_RATIO, _FLAT = 1.5, 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class TrueObjects:
+    """The n labelled objects of a scene.
+
+    Attributes:
+        T_bin_object: (n, 4, 4) true poses in the bin's frame, metres.
+        visible: (n,) bool, whether an image shows a tenth of the object, or does not tell how much it shows.
+    """
+
+    T_bin_object: np.ndarray
+    visible: np.ndarray
 
 
 class RecordedScene:
@@ -37,6 +53,7 @@ class RecordedScene:
         object_id: BOP's number of the model; None if all objects are of it.
         perception: of the object.
         T_bin_camera: (m, 4, 4) camera poses in the frame of the bin: origin at the middle of its floor, z up.
+        estimated: what the estimator found in each of the m views, where that is known already.
 
     Attributes:
         sphere: the grid of views around the bin, of the cameras' median distance.
@@ -54,9 +71,10 @@ class RecordedScene:
         object_id: int | None,
         perception: Perception,
         T_bin_camera: np.ndarray,
+        estimated: Sequence[PerceivedView] | None = None,
     ) -> None:
         self.recording, self.model, self.T_bin_camera = scene, model, T_bin_camera
-        self._object_id, self._perception = object_id, perception
+        self._object_id, self._perception, self._estimated = object_id, perception, estimated
         positions = T_bin_camera[:, :3, 3]
         distance = np.linalg.norm(positions, axis=1)
         self.sphere = ViewSphere(float(np.median(distance)))
@@ -70,31 +88,52 @@ class RecordedScene:
         """What the estimator finds in the recorded view of this number, boxes turned upright."""
         if index not in self._known:
             T = self.T_bin_camera[index]
-            seen = self._perception(replace(self.recording.view(index, index + 1), T_world_camera=T))
+            if self._estimated is None:
+                seen = self._perception(replace(self.recording.view(index, index + 1), T_world_camera=T))
+            else:
+                seen = self._estimated[index]
+                seen = replace(seen, view=replace(seen.view, stamp=index + 1, T_world_camera=T))
             upright = look_at(T[:3, 3], T[:3, 3] + T[:3, 2])
             turn = (invert(upright) @ T)[:2, :2]
             boxes = turn_boxes(seen.hypotheses.box, turn, seen.view.camera)
             self._known[index] = replace(seen, hypotheses=replace(seen.hypotheses, box=boxes), T_world_shown=upright)
         return self._known[index]
 
-    def truth(self) -> np.ndarray:
-        """(n, 4, 4) true poses in the bin's frame: those of all images, each object once, if an image shows enough.
+    def truth(self, warn: Callable[[str], None] = lambda text: None) -> TrueObjects:
+        """The labelled objects of all images, each once.
+
+        Objects of an image are matched one to one with those of the images before it, by the distance of their middles:
+        solids cannot share a middle, but nested ones come close. Objects of one image are never taken for one.
+
+        Args:
+            warn: called where labels of the images disagree.
 
         Raises:
-            ValueError: the recording has no ground truth of the object.
+            ValueError: the recording has no ground truth of the object, or no image shows enough of one.
         """
-        apart, found = SymmetricDistance(self.model).between, np.zeros((0, 4, 4))
+        apart, limit = SymmetricDistance(self.model).between, _SAME_OBJECT * self.model.diameter
+        found, visible, most, turned = np.zeros((0, 4, 4)), np.zeros(0, bool), 0, 0
         for index, image in enumerate(self.recording.truth or ()):
-            chosen = image.object_id == (image.object_id if self._object_id is None else self._object_id)
-            # Without a record of it, every object counts as visible.
-            chosen &= ~(image.visible_fraction < VISIBILITY_THRESHOLD)
+            chosen = of_object(image, self._object_id)
             poses = self.T_bin_camera[index] @ self.model.T_camera_object(image.T_camera_object[chosen])
-            for T in poses:
-                if not len(found) or apart(T[None], found).min() > _SAME_OBJECT * self.model.diameter:
-                    found = np.concatenate([found, T[None]])
-        if not len(found):
-            raise ValueError(f"{self.recording.folder}: no ground truth of object {self._object_id or self.model.name}")
-        return found
+            # Without a record of it, every object counts as visible.
+            shown = ~(image.visible_fraction[chosen] < VISIBILITY_THRESHOLD)
+            known = match(cdist(found[:, :3, 3], poses[:, :3, 3]), limit)
+            again = known >= 0
+            turned += int((apart(found, poses)[known[again], again] > limit).sum())
+            visible[known[again]] |= shown[again]
+            found, visible = np.concatenate([found, poses[~again]]), np.concatenate([visible, shown[~again]])
+            most = max(most, len(poses))
+        if not visible.any():
+            what = f"object {self._object_id or self.model.name} that is visible by a tenth in an image that is used"
+            raise ValueError(f"{self.recording.folder}: no ground truth of {what}")
+        name = self.recording.folder.name
+        if turned:
+            warn(f"{name}: {turned} labels are where an earlier image has an object in another pose; the first counts")
+        if len(found) > most:
+            why = "labels are partial, or camera poses disagree"
+            warn(f"{name}: {len(found)} objects in all, but no image lists more than {most}: {why}")
+        return TrueObjects(found, visible)
 
 
 class RecordedCamera:
@@ -131,6 +170,11 @@ class RecordedCamera:
         return self._scene.perceive(self.taken[-1]).at(len(self.taken) * NANOSECONDS)
 
 
+def of_object(image: ImageTruth, object_id: int | None) -> np.ndarray:
+    """(n,) bool, which of n labels are of an object by BOP's number; all if it is None."""
+    return np.full(len(image.object_id), True) if object_id is None else image.object_id == object_id
+
+
 def turn_boxes(boxes: np.ndarray, turn: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     """Boxes in the image of the same camera turned about its optical axis.
 
@@ -149,6 +193,11 @@ def turn_boxes(boxes: np.ndarray, turn: np.ndarray, camera: PinholeCamera) -> np
     return np.clip(np.concatenate([turned.min(axis=1), turned.max(axis=1)], axis=1) / np.tile(size, 2), 0.0, 1.0)
 
 
+def looks_down(T_world_camera: np.ndarray) -> bool:
+    """Whether most of the cameras (m, 4, 4) look down, as they do where the world's z axis is up."""
+    return bool(np.median(T_world_camera[:, 2, 2]) <= -0.05)
+
+
 def find_bin(scene: BopScene, model: ObjectModel, warn: Callable[[str], None] = lambda text: None) -> np.ndarray:
     """(m, 4, 4) ``T_bin_camera`` of a recording with camera poses: the world is moved to where the cameras look.
 
@@ -159,7 +208,7 @@ def find_bin(scene: BopScene, model: ObjectModel, warn: Callable[[str], None] = 
         ValueError: most cameras look up, so that the world's z axis is not up.
     """
     T = scene.T_world_camera
-    if np.median(T[:, 2, 2]) > -0.05:
+    if not looks_down(T):
         raise ValueError(f"{scene.folder}: the cameras do not look down, so the world's z axis is not up")
     middle = _looked_at(scene)
     in_place = np.linalg.norm(middle) < model.diameter

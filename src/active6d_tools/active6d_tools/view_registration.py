@@ -14,8 +14,10 @@ from active6d_perception.model.symmetric_distance import SymmetricDistance
 _NEAR = 0.12
 #: Two such poses agree if they are at most this far apart, as a fraction of the diameter.
 _AGREES = 0.3
-#: Objects that two images must share, and their least share of those of the smaller image.
-_FEWEST, _SHARE = 5, 0.5
+#: Objects that two images must share.
+FEWEST_SHARED = 5
+#: Their least share of those of the smaller image.
+_SHARE = 0.5
 #: A second placement that fits as well as this share of the best makes the pair ambiguous.
 _AMBIGUOUS = 0.75
 #: Three points whose longest side is this share of the circumference are nearly on a line, and fix no rotation.
@@ -45,13 +47,14 @@ def register_views(
     first = max(range(len(poses)), key=lambda index: len(poses[index]))
     placed, scene = {first: np.eye(4)}, poses[first]
     waiting = {index: "" for index in range(len(poses)) if index != first}
-    while waiting:
-        for index in waiting:
-            T, waiting[index] = placing.place(scene, poses[index], rng)
-            if T is not None:
-                break
-        else:
-            break
+    # How many objects were known when an image was tried last: it fits no better before there are more.
+    tried = dict.fromkeys(waiting, -1)
+    while stale := [index for index in waiting if tried[index] < len(scene)]:
+        index = min(stale, key=tried.__getitem__)
+        tried[index] = len(scene)
+        T, waiting[index] = placing.place(scene, poses[index], rng)
+        if T is None:
+            continue
         placed[index] = T
         del waiting[index]
         seen = T @ poses[index]
@@ -88,7 +91,7 @@ class _Placing:
 
     def place(self, a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray | None, str]:
         """``T_a_b`` (4, 4) that brings most poses (k, 4, 4) of b onto those of a, or None and why."""
-        needed = max(_FEWEST, int(np.ceil(_SHARE * min(len(a), len(b)))))
+        needed = max(FEWEST_SHARED, int(np.ceil(_SHARE * min(len(a), len(b)))))
         if min(len(a), len(b)) < needed:
             return None, f"it shows {min(len(a), len(b))} objects, and {needed} must be shared"
         points = a[:, :3, 3], b[:, :3, 3]

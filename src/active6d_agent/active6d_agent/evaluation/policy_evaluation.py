@@ -119,7 +119,8 @@ class Intervals:
     their starts (a cluster bootstrap): the range over other scenes. The starts of a scene share one heap, so they are
     not independent. A claim about unseen scenes needs the second, wider interval. A bootstrap of few scenes is too
     narrow: it is widened as Student's distribution and the factor for the sample's variance say (Hesterberg, "What
-    teachers should know about the bootstrap", 2015), by 22 % with ten scenes, and stays within the values.
+    teachers should know about the bootstrap", 2015), by 22 % with ten scenes, and stays within the values. One scene
+    says nothing of others: ``ci95_scenes`` is None.
 
     To compare two policies from the same starts, give the differences, which pairs the episodes.
 
@@ -135,29 +136,32 @@ class Intervals:
         self._factor = dict.fromkeys(clusters, 1.0)
         for kind, cluster in clusters.items():
             count = cluster.max() + 1
+            if kind == "ci95_scenes" and count == 1:
+                continue
             rng = np.random.default_rng(seed)
             weight = rng.multinomial(count, np.full(count, 1.0 / count), size=resamples)[:, cluster]
             self._weights[kind] = weight / weight.sum(axis=1, keepdims=True)
-            if kind == "ci95_scenes" and count > 1:
+            if kind == "ci95_scenes":
                 narrow = norm.ppf(0.975) * np.sqrt((count - 1) / count)
                 self._factor[kind] = float(t.ppf(0.975, count - 1) / narrow)
 
-    def of(self, values: np.ndarray) -> dict[str, list[float]]:
-        """Both intervals of the mean of (E,) values, by name."""
-        return {
-            kind: self._interval(kind, weight @ values, values.mean(), values) for kind, weight in self._weights.items()
-        }
+    def of(self, values: np.ndarray) -> dict[str, list[float] | None]:
+        """Both intervals of the mean of (E,) values, by name; ``ci95_scenes`` is None with one scene."""
+        table: dict[str, list[float] | None] = dict.fromkeys(self._factor)
+        for kind, weight in self._weights.items():
+            table[kind] = self._interval(kind, weight @ values, values.mean(), values)
+        return table
 
     def _interval(self, kind: str, resampled: np.ndarray, centre: float, values: np.ndarray) -> list[float]:
         ends = np.quantile(resampled, [0.025, 0.975])
         return np.clip(centre + self._factor[kind] * (ends - centre), values.min(), values.max()).tolist()
 
-    def of_ratio(self, part: np.ndarray, whole: np.ndarray) -> dict[str, list[float]]:
-        """Both intervals of the mean of (E,) ``part`` over that of (E,) ``whole``.
+    def of_ratio(self, part: np.ndarray, whole: np.ndarray) -> dict[str, list[float] | None]:
+        """Both intervals of the mean of (E,) ``part`` over that of (E,) ``whole``; ``ci95_scenes`` as in :meth:`of`.
 
         Some of ``whole`` must be positive; resamples without any are left out.
         """
-        table = {}
+        table: dict[str, list[float] | None] = dict.fromkeys(self._factor)
         for kind, weight in self._weights.items():
             wholes = weight @ whole
             some = wholes > 0
@@ -224,12 +228,16 @@ def compare(own: Measures, other: Measures, intervals: Intervals) -> dict[str, d
     """Paired differences of each measure (E,), positive where ``own`` is higher.
 
     They are ``mean``, both intervals, and whether these exclude zero (``excludes_zero``, ``excludes_zero_scenes``).
+    An interval that does not exist, over scenes where there is one, excludes nothing.
     """
     table = {}
     for name, values in own.items():
         difference = values - other[name]
         both = intervals.of(difference)
-        sure = {f"excludes_zero{kind.removeprefix('ci95')}": low > 0 or high < 0 for kind, (low, high) in both.items()}
+        sure = {
+            f"excludes_zero{kind.removeprefix('ci95')}": ends is not None and (ends[0] > 0 or ends[1] < 0)
+            for kind, ends in both.items()
+        }
         table[name] = {"mean": float(difference.mean()), **both, **sure}
     return table
 

@@ -56,14 +56,17 @@ class BopScene:
         cameras: (m) intrinsics.
         T_world_camera: (m, 4, 4) poses of the optical frame in the recording's world, metres; the identity where the
             recording has none.
+        has_pose: (m,) bool, whether the recording has a pose of each image's camera. A world can be the first
+            camera's frame, so that an identity can be a pose.
         depth_scale: (m) millimetres per step of the depth image.
-        truth: (m) ground truth, None where the recording has none.
+        truth: (m) ground truth, None where the recording has none; empty for images that it does not list.
     """
 
     folder: Path
     image_ids: tuple[int, ...]
     cameras: tuple[PinholeCamera, ...]
     T_world_camera: np.ndarray
+    has_pose: np.ndarray
     depth_scale: tuple[float, ...]
     truth: tuple[ImageTruth, ...] | None
 
@@ -83,9 +86,11 @@ class BopScene:
         entries = _read_by_image(path)
         if not entries:
             raise ValueError(f"{path}: no image")
-        cameras, poses, scales = [], [], []
+        cameras, poses, has_pose, scales = [], [], [], []
         for image, entry in entries.items():
-            poses.append(_read_camera_pose(entry, path, image, needs_poses))
+            T_world_camera = _read_camera_pose(entry, path, image, needs_poses)
+            has_pose.append(T_world_camera is not None)
+            poses.append(np.eye(4) if T_world_camera is None else T_world_camera)
             scale = float(_numbers(entry, "depth_scale", 1, path, image)[0])
             if not scale > 0:
                 raise ValueError(f"{path}: image {image}: depth_scale must be positive, got {scale}")
@@ -100,7 +105,8 @@ class BopScene:
             if _size(color) != size:
                 raise ValueError(f"{color}: is {_size(color)} pixels, its depth image {size}")
         truth = _read_truth(folder, tuple(entries)) if (folder / TRUTH_FILE).is_file() else None
-        return cls(folder, tuple(entries), tuple(cameras), np.array(poses), tuple(scales), truth)
+        known = np.array(has_pose)
+        return cls(folder, tuple(entries), tuple(cameras), np.array(poses), known, tuple(scales), truth)
 
     def __len__(self) -> int:
         return len(self.image_ids)
@@ -112,6 +118,7 @@ class BopScene:
             tuple(self.image_ids[i] for i in index),
             tuple(self.cameras[i] for i in index),
             self.T_world_camera[list(index)],
+            self.has_pose[list(index)],
             tuple(self.depth_scale[i] for i in index),
             None if self.truth is None else tuple(self.truth[i] for i in index),
         )
@@ -220,14 +227,19 @@ def _read_by_image(path: Path) -> dict[int, Any]:
     try:
         content = read_json(path)
     except FileNotFoundError as error:
-        cameras = sorted(each.name for each in path.parent.glob(f"{path.stem}_*.json"))
-        several = f"; it has {', '.join(cameras)}: copy one camera's files to the usual names" if cameras else ""
+        several = describe_cameras(path.parent)
         raise ValueError(f"{path}: no such file; a BOP scene folder needs it{several}") from error
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not a JSON file ({error})") from error
     if not isinstance(content, dict) or not all(key.isascii() and key.isdecimal() for key in content):
         raise ValueError(f"{path}: must map image numbers to entries")
     return {int(key): content[key] for key in sorted(content, key=int)}
+
+
+def describe_cameras(folder: Path) -> str:
+    """What to do where a scene folder has the files of several cameras, ``scene_camera_NAME.json``; else empty."""
+    cameras = sorted(each.name for each in folder.glob(f"{Path(CAMERA_FILE).stem}_*.json"))
+    return f"; it has {', '.join(cameras)}: copy one camera's files to the usual names" if cameras else ""
 
 
 def _read_truth(folder: Path, image_ids: tuple[int, ...]) -> tuple[ImageTruth, ...]:
@@ -240,22 +252,30 @@ def _read_truth(folder: Path, image_ids: tuple[int, ...]) -> tuple[ImageTruth, .
         poses = [_read_pose(entry, "cam_R_m2c", "cam_t_m2c", path, image) for entry in entries]
         kinds = [_numbers(entry, "obj_id", 1, path, image)[0] for entry in entries]
         visible = np.full(len(entries), np.nan)
-        if visibility is not None:
+        if visibility is not None and image in visibility and image in by_image:
             known = _entries(visibility, visibility_path, image)
             if len(known) != len(entries):
                 raise ValueError(
                     f"{visibility_path}: image {image}: {len(known)} objects, {TRUTH_FILE} has {len(entries)}"
                 )
-            visible[:] = [_numbers(entry, "visib_fract", 1, visibility_path, image)[0] for entry in known]
+            visible[:] = [_visible_fraction(entry, visibility_path, image) for entry in known]
         truth.append(ImageTruth(np.array(kinds, int), np.array(poses).reshape(-1, 4, 4), visible))
     return tuple(truth)
 
 
 def _entries(by_image: dict[int, Any], path: Path, image: int) -> list[Any]:
-    entries = by_image.get(image)
+    """The objects of an image; none where the file does not list it: it has no labels."""
+    entries = by_image.get(image, [])
     if not isinstance(entries, list):
         raise ValueError(f"{path}: image {image}: no list of objects")
     return entries
+
+
+def _visible_fraction(entry: Any, path: Path, image: int) -> float:
+    """Of one object, NaN where its entry has none."""
+    if isinstance(entry, dict) and "visib_fract" not in entry:
+        return float("nan")
+    return float(_numbers(entry, "visib_fract", 1, path, image)[0])
 
 
 def _numbers(entry: Any, key: str, count: int, path: Path, image: int) -> np.ndarray:
@@ -280,10 +300,10 @@ def _read_pose(entry: Any, rotation: str, translation: str, path: Path, image: i
     return transform_from_quaternion(quaternion_from_transform(make_transform(R, metres)), metres)
 
 
-def _read_camera_pose(entry: Any, path: Path, image: int, needed: bool) -> np.ndarray:
-    """(4, 4) ``T_world_camera`` in metres; the identity where the entry has none and none is needed."""
+def _read_camera_pose(entry: Any, path: Path, image: int, needed: bool) -> np.ndarray | None:
+    """(4, 4) ``T_world_camera`` in metres; None where the entry has none and none is needed."""
     if not needed and isinstance(entry, dict) and not entry.keys() & {"cam_R_w2c", "cam_t_w2c"}:
-        return np.eye(4)
+        return None
     T_world_camera = invert(_read_pose(entry, "cam_R_w2c", "cam_t_w2c", path, image))
     if needed and not np.linalg.norm(T_world_camera[:3, 3]) > 1e-6:
         raise ValueError(f"{path}: image {image}: cam_t_w2c puts the camera at the world's origin")

@@ -13,6 +13,7 @@ from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
     from active6d_perception.active6d import Active6D
+    from active6d_tools.bop_results import BopEstimates
     from active6d_tools.image_estimation import ImageResult, NumberedImage, Overlay
 
 _SENSOR = (
@@ -63,7 +64,7 @@ def estimate(
 
     if region_in_world and (region is None or folder is None):
         raise ValueError("--region-in-world needs --region and a scene folder with camera poses")
-    scene_id, images = _read(folder, rgb, depth, intrinsics, depth_scale, region_in_world)
+    scene_id, numbering, images = _read(folder, rgb, depth, intrinsics, depth_scale, region_in_world)
     box = (np.array(region[:3]), np.array(region[3:])) if region is not None else None
     with messages.status(f"loading the estimator of {object_name}"):
         finder = Active6D(object_name, estimator)
@@ -73,9 +74,9 @@ def estimate(
     found = estimate_images(finder, scene_id, images, **crop, sensor=sensor, on_left_out=left_out.append)
     results = _draw_each(found, len(images), Overlay(finder.model), out / "overlays", min_score)
     _print(results, min_score)
-    write_file(out / "results.csv", bop_csv((result.bop for result in results), finder.model, object_id))
+    write_file(out / "results.csv", bop_csv(results, finder.model, object_id))
     messages.print(f"wrote {out / 'results.csv'} and {out / 'overlays'}", highlight=False, markup=False)
-    for text in left_out:
+    for text in filter(None, [numbering, *left_out]):
         messages.print(text, highlight=False, markup=False)
     report = {"object": object_name, "estimator": estimator, "images": describe(results, finder.model)}
     write_json(json_file, {**report, "left_out": left_out})
@@ -92,21 +93,21 @@ def _print_model_difference(folder: Path | None, object_id: int, finder: "Active
 
 def _draw_each(
     found: Iterator["ImageResult"], total: int, overlay: "Overlay", folder: Path, min_score: float
-) -> list["ImageResult"]:
-    """The results; each is drawn as soon as it is there."""
+) -> list["BopEstimates"]:
+    """The results; each is drawn as soon as it is there, and its images and masks are not kept."""
     results = []
     with progress_bar() as bar:
         for result in bar.track(found, total=total, description="estimating"):
-            results.append(result)
+            results.append(result.bop)
             shown = result.hypotheses.take(result.hypotheses.score >= min_score)
             write_png(folder / f"{result.image_id:06d}.png", overlay.draw(result.view, shown))
     return results
 
 
-def _print(results: list["ImageResult"], min_score: float) -> None:
+def _print(results: list["BopEstimates"], min_score: float) -> None:
     for result in results:
-        sure = int((result.hypotheses.score >= min_score).sum())
-        text = f"image {result.image_id:6}  hypotheses {len(result.hypotheses):3}  score >= {min_score:g}: {sure:3}"
+        sure = int((result.score >= min_score).sum())
+        text = f"image {result.image_id:6}  hypotheses {len(result.score):3}  score >= {min_score:g}: {sure:3}"
         console.print(f"{text}  {result.seconds:.2f} s", highlight=False)
 
 
@@ -117,8 +118,8 @@ def _read(
     intrinsics: Path | None,
     depth_scale: float | None,
     needs_poses: bool,
-) -> tuple[int, list["NumberedImage"]]:
-    """BOP scene id, and images with their BOP image ids."""
+) -> tuple[int, str, list["NumberedImage"]]:
+    """BOP scene id, what to say of it, and images with their BOP image ids."""
     from active6d_tools.image_estimation import read_image, read_scene
 
     single = (rgb, depth, intrinsics)
@@ -129,4 +130,4 @@ def _read(
     if rgb is None or depth is None or intrinsics is None:
         raise ValueError("give a scene folder in BOP format, or all of --rgb, --depth and --intrinsics")
     view = read_image(rgb, depth, intrinsics, depth_scale)
-    return 0, [(0, lambda: view)]
+    return 0, "", [(0, lambda: view)]

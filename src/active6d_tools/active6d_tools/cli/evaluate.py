@@ -138,12 +138,15 @@ def _evaluate_recorded(
             write_file(path, bop_csv(written, model, evaluation.object_id))
             left_out = f"; {others} episodes that ended at an image of another one are not in it" if others else ""
             warn(f"wrote {path}{left_out}")
+    if csv is not None and evaluation.numbering:
+        warn(evaluation.numbering)
     summary = summarise(results, object_name, settings["steps"], settings["seed"])
     _print_policies(summary)
     episodes = {name: {key: own.measures[key].tolist() for key in own.measures} for name, own in results.items()}
     images = {name: own.views.tolist() for name, own in results.items()}
+    scenes = [scene.recording.folder.name for scene in evaluation.scenes]
     more = {"bop": str(folder), "parameters": parameters, "measures": episodes, "views": images}
-    write_json(json_file, {**summary, **settings, "starts": evaluation.starts.tolist(), **more})
+    write_json(json_file, {**summary, **settings, "starts": evaluation.start_images, "scene_folders": scenes, **more})
 
 
 def _print_policies(summary: dict[str, Any]) -> None:
@@ -151,8 +154,8 @@ def _print_policies(summary: dict[str, Any]) -> None:
     for name, row in summary["policies"].items():
         cells = [name, f"{row['distance_m']:.2f}"]
         for key, digits in (("e_add_mm", 2), ("detection_rate", 3)):
-            low, high = row[f"{key}_ci95_scenes"]
-            cells += [f"{row[key]:.{digits}f}", f"[dim]{low:.{digits}f}-{high:.{digits}f}[/dim]"]
+            ends = row[f"{key}_ci95_scenes"]
+            cells += [f"{row[key]:.{digits}f}", _range(ends, f".{digits}f", "-")]
         cells += [f"{row[key]:.3f}" if row.get(key) is not None else "-" for key in ("confirmed_rate", "wrong")]
         rows.append([*cells, "-" if row["gap_closed"] is None else f"{row['gap_closed']:.0%}"])
     title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
@@ -166,9 +169,14 @@ def _print_differences(summary: dict[str, Any]) -> None:
     for name, measured in summary["policies"][_DEFAULT]["against"].items():
         cells = [name, f"{measured['distance_m']['mean']:+.2f}"]
         for key, digits in (("e_add_mm", 2), ("detection_rate", 3)):
-            low, high = (f"{end:+.{digits}f}" for end in measured[key]["ci95_scenes"])
+            ends = _range(measured[key]["ci95_scenes"], f"+.{digits}f", " ")
             style = "bold" if measured[key]["excludes_zero_scenes"] else "dim"
-            cells += [f"[{style}]{measured[key]['mean']:+.{digits}f}[/]", f"[dim]{low} {high}[/dim]"]
+            cells += [f"[{style}]{measured[key]['mean']:+.{digits}f}[/]", ends]
         rows.append(cells)
     title = f"{_DEFAULT} minus the others, from the same starts"
     print_table(("against", "distance, m", "ADD, mm", "", "detected", ""), rows, title=title)
+
+
+def _range(ends: list[float] | None, form: str, between: str) -> str:
+    """Both ends of an interval; a dash where there is one scene, and so no interval over scenes."""
+    return "-" if ends is None else f"[dim]{between.join(f'{end:{form}}' for end in ends)}[/dim]"

@@ -31,9 +31,11 @@ def ablation_panels(part: str, rows: list[dict[str, Any]]) -> list[Panel]:
         lines: dict[str, tuple[Any, ...]] = {}
         for name in dict.fromkeys(row.get(line, label) for row in rows):
             own = [row for row in rows if row.get(line, label) == name]
-            interval = list(zip(*(row[f"{key}_ci95_scenes"] for row in own), strict=True))
+            # Where there is one scene, there is no interval over scenes, and the line stands alone.
+            known = [ends for row in own if (ends := row[f"{key}_ci95_scenes"]) is not None]
+            interval = [list(zip(*known, strict=True))] if len(known) == len(own) else []
             # As text, so that few views have as much room as many.
-            lines[name] = ([str(row[x]) for row in own], [row[key] for row in own], interval)
+            lines[name] = ([str(row[x]) for row in own], [row[key] for row in own], *interval)
         panels.append(Panel(x_label, label, lines))
     return panels
 

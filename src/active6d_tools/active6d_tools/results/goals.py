@@ -51,7 +51,8 @@ def beats(report: dict[str, Any], name: str, others: Iterable[str], keys: Sequen
     for other in others:
         for key in keys:
             difference, (unit, digits, better) = against[other][key], MEASURES[key]
-            ends = sorted(better * end for end in difference["ci95_scenes"])
+            # In one scene there is no interval over scenes, so that over episodes ranks the leads.
+            ends = sorted(better * end for end in difference["ci95_scenes"] or difference["ci95"])
             lead = number(difference["mean"], digits, True) + unit
             figures = f"{lead} against `{other}` {interval(difference['ci95_scenes'], digits, True)}"
             # In units of the uncertainty, so that rates and millimetres are comparable.

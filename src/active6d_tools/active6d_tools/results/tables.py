@@ -55,9 +55,9 @@ def percent(share: float, sign: bool = False) -> str:
     return f"{100 * share:{'+' if sign else ''}.0f} %"
 
 
-def interval(ends: Sequence[float], digits: int, sign: bool = False) -> str:
-    """An interval in brackets."""
-    return f"({' to '.join(number(end, digits, sign) for end in ends)})"
+def interval(ends: Sequence[float] | None, digits: int, sign: bool = False) -> str:
+    """An interval in brackets, a dash where there is none."""
+    return "-" if ends is None else f"({' to '.join(number(end, digits, sign) for end in ends)})"
 
 
 def mark(difference: dict[str, Any], better: int) -> str:
@@ -194,7 +194,8 @@ def noise_resampling_table(reports: Reports) -> str:
     """Policies and noise as rows: detection rate, error, and the share of the gap with its interval over scenes."""
 
     def render(row: dict[str, Any]) -> str:
-        share, (low, high) = row["gap_closed"], row["gap_closed_ci95_scenes"]
+        # Without an interval, as in one scene, the share stands alone.
+        share, (low, high) = row["gap_closed"], row["gap_closed_ci95_scenes"] or (0.0, 0.0)
         ends = f" ({100 * low:.0f} to {100 * high:.0f})" if high - low > 0.005 else ""
         return f"{describe_row(row, ('detection_rate', 'e_add_mm'))}, {percent(share)}{ends}"
 

@@ -21,6 +21,7 @@ from active6d_agent.evaluation.oracle import known
 from active6d_agent.evaluation.policy_evaluation import Intervals, all_starts, run_named
 from active6d_core.metrics import DETECTION_FRACTION
 from active6d_sim.scenes.scene_store import load_scene, stored_names
+from active6d_tools.results.tables import interval
 from active6d_tools.studies.arguments import study_parser
 
 STEPS = 5
@@ -105,9 +106,9 @@ def main() -> None:
     low, high = (results[name].detection_rate.mean() for name in ("random", "oracle"))
     for name, result in results.items():
         rate = result.detection_rate
-        lower, upper = Intervals(starts[:, 0]).of(rate)["ci95_scenes"]
+        ends = Intervals(starts[:, 0]).of(rate)["ci95_scenes"]
         share = (rate.mean() - low) / (high - low)
-        print(f"{arguments.object} {name:15} {rate.mean():.3f} ({lower:.3f} to {upper:.3f}) gap closed {share:.0%}")
+        print(f"{arguments.object} {name:15} {rate.mean():.3f} {interval(ends, 3)} gap closed {share:.0%}")
 
 
 if __name__ == "__main__":
