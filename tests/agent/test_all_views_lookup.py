@@ -163,6 +163,15 @@ def test_the_look_up_finds_what_the_node_finds(bank, simulator):
     assert sorted(node.support) == sorted(table.support)
 
 
+def test_a_bank_of_other_rotations_is_refused(bank):
+    """As after a symmetry was declared: indices beyond the tables are not checked in the kernel."""
+    tables = bank.scenes[0].evidence
+    fewer = replace(tables, T_world_object=tables.T_world_object[:, :6], telling=tables.telling[:, :, :6])
+    old = replace(bank, scenes=[replace(bank.scenes[0], evidence=fewer)])
+    with pytest.raises(ValueError, match="6 rotations of each body, and mug has 36; make it again"):
+        AllViewsLookup(old)
+
+
 def test_a_bank_without_evidence_is_fused_by_the_best_view(bank):
     old = replace(bank, scenes=[replace(scene, evidence=None) for scene in bank.scenes])
     assert isinstance(make_lookup(old), BestViewLookup)
