@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_scenes import three_mugs
+import trimesh
+from hand_made_scenes import make_model, three_mugs
 from scipy.special import expit
 
 from active6d_agent.bank.all_views_lookup import AllViewsLookup, index_scene, make_belief, make_lookup
@@ -134,6 +135,13 @@ def test_the_compiled_belief_is_that_of_the_fusion(bank):
         np.testing.assert_allclose(fused.description, expected[order], rtol=1e-3, atol=2e-3)
         np.testing.assert_allclose(fused.probability, probability[order], atol=2e-3)
         np.testing.assert_allclose(fused.entropy, beliefs.entropy[order], atol=2e-3)
+
+
+def test_shorter_distances_separate_slim_objects():
+    rod = make_model(trimesh.creation.box((0.2, 0.02, 0.02)))
+    belief = make_belief(rod, load_belief(belief_path("mug")), FusionParameters(cut=0.3, exclusion=0.2))
+    # 0.2 diameters become three quarters of the thickness.
+    assert (belief.cut, belief.exclusion) == pytest.approx((0.0225, 0.015))
 
 
 def test_the_look_up_finds_what_the_node_finds(bank, simulator):

@@ -61,8 +61,10 @@ def make_belief(model: ObjectModel, weights: BeliefWeights, parameters: FusionPa
     ambiguity, tolerance = ambiguity_of(model), DETECTION_FRACTION * model.diameter
     errors = ambiguity.rotation_errors
     similar = np.maximum(0.0, 1.0 - (errors / tolerance) ** 2)
-    lengths = model.diameter / ambiguity.scale, parameters.cut * model.diameter, parameters.exclusion * model.diameter
-    return Belief.of(weights, similar, errors < tolerance, *lengths, parameters.least_probability)
+    apart = parameters.cut * ambiguity.spacing, parameters.exclusion * ambiguity.spacing
+    return Belief.of(
+        weights, similar, errors < tolerance, model.diameter / ambiguity.scale, *apart, parameters.least_probability
+    )
 
 
 def index_scene(scene: BankScene, model: ObjectModel, sphere: ViewSphere, cut: float) -> SceneIndex:

@@ -11,7 +11,7 @@ import numpy as np
 
 from active6d_core.object_model import ObjectModel, Symmetry
 from active6d_core.se3 import transform_points
-from active6d_perception.model.length_scale import fusion_scale
+from active6d_perception.model.length_scale import fusion_scale, spacing
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.near_symmetry import near_symmetries, telling_surface
 from active6d_perception.model.solid import Solid, solid_of
@@ -46,12 +46,13 @@ class Ambiguity:
         telling_twins: (s,) bool, which of the others tell the twins apart.
         middle: (3,) middle of the body, which rotations leave in place; object frame, metres.
         diameter: of the object, metres.
+        spacing: metres, see :func:`.spacing`.
         scale: factor on lengths, see :func:`.fusion_scale`.
     """
 
     def __init__(self, model: ObjectModel) -> None:
         self.model, self.views, self.diameter = model, model_views(model), model.diameter
-        self.scale = fusion_scale(model)
+        self.scale, self.spacing = fusion_scale(model), spacing(model)
         near = self._near = near_symmetries(model)
         self.twins = near.T_object_twin
         self.rotations, self.telling = np.eye(4)[None], np.zeros(len(self.views.points), bool)
