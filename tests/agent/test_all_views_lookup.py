@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_scenes import three_mugs
+import trimesh
+from hand_made_scenes import make_model, three_mugs
 from scipy.special import expit
 
 from active6d_agent.bank.all_views_lookup import AllViewsLookup, index_scene, make_belief, make_lookup
@@ -139,6 +140,13 @@ def test_the_compiled_belief_is_that_of_the_fusion(bank):
         np.testing.assert_allclose(fused.entropy, beliefs.entropy[order], atol=2e-3)
 
 
+def test_shorter_distances_separate_slim_objects():
+    rod = make_model(trimesh.creation.box((0.2, 0.02, 0.02)))
+    belief = make_belief(rod, load_belief(belief_path("mug")), FusionParameters(cut=0.3, exclusion=0.2))
+    # 0.2 diameters become three quarters of the thickness.
+    assert (belief.cut, belief.exclusion) == pytest.approx((0.0225, 0.015))
+
+
 def test_the_look_up_finds_what_the_node_finds(bank, simulator):
     model, scene = load_object("mug"), simulator.scene
     lookup = make_lookup(bank)
@@ -175,6 +183,15 @@ def test_a_scene_in_which_nothing_was_found_has_no_object(bank, simulator, tmp_p
     assert (fused.objects >= 0).sum(axis=1).tolist() == [0, 3]
     assert len(lookup.fuse(np.zeros(2, int), views, views[:, -1]).objects[0]) == 0
     assert len(lookup.describe_fused(0, np.array([1, 2]))[1]) == 0
+
+
+def test_a_bank_of_other_rotations_is_refused(bank):
+    """As after a symmetry was declared: indices beyond the tables are not checked in the kernel."""
+    tables = bank.scenes[0].evidence
+    fewer = replace(tables, T_world_object=tables.T_world_object[:, :6], telling=tables.telling[:, :, :6])
+    old = replace(bank, scenes=[replace(bank.scenes[0], evidence=fewer)])
+    with pytest.raises(ValueError, match="6 rotations of each body, and mug has 36; make it again"):
+        AllViewsLookup(old)
 
 
 def test_a_bank_without_evidence_is_fused_by_the_best_view(bank):

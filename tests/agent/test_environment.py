@@ -6,6 +6,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+import trimesh
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -51,6 +52,18 @@ def test_fusion_is_the_nodes(lookup, scene, views):
     expected, actual = fuse_as_the_node_does(lookup, scene, views), lookup.objects(scene, views)
     for name in ("T_world_object", "verification", "score", "depth", "box", "support", "spread"):
         np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), atol=2e-6, err_msg=name)
+
+
+def test_fusion_of_a_slim_object_is_the_nodes(tmp_path, monkeypatch):
+    """Shorter distances separate its hypotheses and its objects."""
+    trimesh.creation.box((0.2, 0.02, 0.02)).export(tmp_path / "slim_rod.ply")
+    text = "name: slim_rod\nmesh: slim_rod.ply\ninstances: [1, 3]\ncolor: [0.5, 0.5, 0.5]\n"
+    (tmp_path / "slim_rod.yaml").write_text(text)
+    monkeypatch.setenv("ACTIVE6D_OBJECT_PATH", str(tmp_path))
+    lookup = BestViewLookup(synthetic_bank("slim_rod", scenes=1))
+    expected, actual = fuse_as_the_node_does(lookup, 0, EPISODE), lookup.objects(0, EPISODE)
+    np.testing.assert_allclose(actual.T_world_object, expected.T_world_object, atol=1e-9)
+    np.testing.assert_array_equal(actual.support, expected.support)
 
 
 def test_fusion_parameters_are_honoured():

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from active6d_core.camera import PinholeCamera
 from active6d_core.hypotheses import Hypotheses
 from active6d_core.metrics import e_add
-from active6d_core.object_model import load_object
+from active6d_core.object_model import ObjectModel, Symmetry, load_object
 from active6d_core.se3 import invert, make_transform
 from active6d_core.view_sphere import ViewSphere
 from active6d_perception.model.ambiguity import ambiguity_of
@@ -109,6 +110,28 @@ def test_all_views_together_know_the_handles(mug, episode):
     assert errors.max() < 1e-3
     assert objects.probability.min() > 0.9
     np.testing.assert_array_equal(objects.support, [4, 4])
+
+
+def test_rods_side_by_side_are_two_objects(render):
+    """25 mm apart, an eighth of their length."""
+    mesh = trimesh.creation.box((0.2, 0.02, 0.012))
+    group = np.stack([np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])]).astype(float)
+    rod = ObjectModel("rod", mesh, float(np.linalg.norm(mesh.extents)), Symmetry(None, group), (1, 3), np.ones(3), {})
+    true = make_transform(np.tile(np.eye(3), (2, 1, 1)), [[0.0, -0.0125, 0.006], [0.0, 0.0125, 0.006]])
+    views = []
+    for number, index in enumerate(VIEWS[:3]):
+        T_world_camera = SPHERE.pose(SPHERE.positions[index])
+        T = invert(T_world_camera) @ true
+        depth = render(rod, T, CAMERA)[0]
+        first = np.abs(render(rod, T[:1], CAMERA)[0] - depth) < 1e-6
+        labels = np.where(np.isfinite(depth), np.where(first, 1, 2), 0).astype(np.uint16)
+        depth = np.where(labels > 0, depth, _floor_depth(T_world_camera)).astype(np.float32)
+        hypotheses = Hypotheses.from_masks(T, np.full(2, 0.9), np.array([1, 2]), labels, depth)
+        views.append((1_000 * (number + 1), T_world_camera, hypotheses, np.full(2, 0.9), depth, CAMERA))
+    objects = objects_of(fuse(rod, views), views[-1])
+    np.testing.assert_allclose(np.sort(objects.T_world_object[:, 1, 3]), [-0.0125, 0.0125], atol=0.001)
+    np.testing.assert_array_equal(objects.support, [3, 3])
+    assert objects.probability.min() > 0.9
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.4])

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+import trimesh
+from hand_made_scenes import make_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -192,6 +194,17 @@ def test_two_objects_cannot_share_a_place():
     positions = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0, 0], [0.03, 0, 0], [0.045, 0, 0]])
     np.testing.assert_array_equal(select(labels, None, positions, 0.02), [0, 3])
     np.testing.assert_array_equal(select(labels, None, positions, 0.0), [0, 1, 3, 4])
+
+
+def test_rods_side_by_side_are_two_objects():
+    """25 mm apart, an eighth of their length; each hypothesis is some millimetres off."""
+    rng, rod = np.random.default_rng(0), make_model(trimesh.creation.box((0.2, 0.02, 0.02)))
+    truth = make_transform(np.tile(np.eye(3), (2, 1, 1)), [[0.0, -0.0125, 0.0], [0.0, 0.0125, 0.0]])
+    cameras = [SPHERE.pose(SPHERE.positions[index]) for index in range(5)]
+    views = [(stamp, camera, *make_view(rng, camera, truth)) for stamp, camera in enumerate(cameras, 1)]
+    objects = fuse(rod, views).objects(5, cameras[-1], DEFAULT_CAMERA)
+    np.testing.assert_allclose(np.sort(objects.T_world_object[:, 1, 3]), [-0.0125, 0.0125], atol=0.006)
+    np.testing.assert_array_equal(objects.support, [5, 5])
 
 
 def test_views_that_agree_outvote_a_surer_one():

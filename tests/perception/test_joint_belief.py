@@ -320,6 +320,27 @@ def test_objects_with_and_without_rotations_are_learned_together():
     assert unseen.right.reshape(200, 6)[np.arange(200), chosen].mean() > 0.75
 
 
+def test_numbers_of_rotations_that_do_not_divide_each_other_are_learned_together():
+    """Repeating each rotation of one episode twice and of another three times says the same as not repeating them."""
+    rng = np.random.default_rng(0)
+    first, second = places(rng, 100), places(rng, 100)
+    rows = np.arange(first.right.shape[1] - 1)
+    second = replace(second, rotations=second.rotations[:, rows], right=second.right[:, rows])
+    second.right[:, 0] |= ~second.right.any(axis=1)
+
+    def repeated(episode, count):
+        return replace(
+            episode, rotations=np.tile(episode.rotations, (1, count, 1)), right=np.tile(episode.right, (1, count))
+        )
+
+    counts = first.right.shape[1], second.right.shape[1]
+    assert np.gcd(*counts) == 1
+    once = fit_belief([first, second])
+    even = fit_belief([repeated(first, counts[1]), repeated(second, counts[0])])
+    for a, b in zip(once, even, strict=True):
+        np.testing.assert_array_equal(a.hidden, b.hidden)
+
+
 def test_without_a_right_pose_nothing_can_be_learned():
     rng = np.random.default_rng(0)
     nothing = replace(places(rng, 1), place=np.zeros(0, int), right=np.zeros((0, 3), bool))

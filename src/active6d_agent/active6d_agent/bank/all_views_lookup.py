@@ -61,13 +61,26 @@ def make_belief(model: ObjectModel, weights: BeliefWeights, parameters: FusionPa
     ambiguity, tolerance = ambiguity_of(model), DETECTION_FRACTION * model.diameter
     errors = ambiguity.rotation_errors
     similar = np.maximum(0.0, 1.0 - (errors / tolerance) ** 2)
-    lengths = model.diameter / ambiguity.scale, parameters.cut * model.diameter, parameters.exclusion * model.diameter
-    return Belief.of(weights, similar, errors < tolerance, *lengths, parameters.least_probability)
+    apart = parameters.cut * ambiguity.spacing, parameters.exclusion * ambiguity.spacing
+    return Belief.of(
+        weights, similar, errors < tolerance, model.diameter / ambiguity.scale, *apart, parameters.least_probability
+    )
 
 
 def index_scene(scene: BankScene, model: ObjectModel, sphere: ViewSphere, cut: float) -> SceneIndex:
-    """The arrays that the kernel needs of a scene with evidence; ``cut`` in metres."""
+    """The arrays that the kernel needs of a scene with evidence; ``cut`` in metres.
+
+    Raises:
+        ValueError: the bank has no evidence, or evidence on other rotations than those of the model.
+    """
     tables, ambiguity = evidence_of(scene), ambiguity_of(model)
+    stored, count = tables.T_world_object.shape[1], len(ambiguity.rotations)
+    # The kernel does not check its indices.
+    if stored != count:
+        raise ValueError(
+            f"{scene.name}: the bank has {stored} rotations of each body, and {model.name} has {count}; make it again "
+            "with 'active6d bank'"
+        )
     T = world_poses(scene.table, scene.view, sphere)
     near = ambiguity.body_distance.between(tables.T_world_body, T).astype(np.float32)
     middles, bodies = (transform_points(each, ambiguity.middle[None])[:, 0] for each in (T, tables.T_world_body))

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from active6d_agent.bank.scene_bank import BankScene, SceneBank, world_poses
 from active6d_agent.bank.scene_lookup import FusedBatch, SceneLookup
 from active6d_core.camera import DEFAULT_CAMERA, PinholeCamera
+from active6d_perception.model.length_scale import spacing
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.scene.clustering import cluster_groups
 from active6d_perception.scene.fusion_parameters import FusionParameters
@@ -49,7 +50,8 @@ class BestViewLookup(SceneLookup):
         self, bank: SceneBank, parameters: FusionParameters | None = None, camera: PinholeCamera = DEFAULT_CAMERA
     ) -> None:
         super().__init__(bank, parameters, camera)
-        self._cut = self.parameters.cut * self.model.diameter
+        self._cut = self.parameters.cut * spacing(self.model)
+        self._exclusion = self.parameters.exclusion * spacing(self.model)
         poses, tables, views, errors = zip(*map(self._sort, bank.scenes), strict=True)
         self._set_hypotheses(np.concatenate(tables).astype(float))
         self._set_poses(poses, errors)
@@ -120,7 +122,7 @@ class BestViewLookup(SceneLookup):
         table = np.full((count, number.max(initial=0)), -1)
         table[episode[leaders], place] = leaders
         positions = self.positions[rows[table]]
-        kept = suppress_neighbours(positions, table >= 0, self.parameters.exclusion * self.model.diameter)
+        kept = suppress_neighbours(positions, table >= 0, self._exclusion)
         order = np.argsort(~kept, axis=1, kind="stable")[:, : kept.sum(axis=1).max(initial=0)]
         table, kept = np.take_along_axis(table, order, 1), np.take_along_axis(kept, order, 1)
         seen = np.full(len(rows), -1)

@@ -54,12 +54,15 @@ class NearSymmetries:
         share: (s,) share of the visible surface that coincides within 2.5 % of the diameter with a similar normal, mean
             over view directions.
         T_object_axis: (4, 4) frame whose z is the axis of continuous near symmetry, such as that of a mug's body; None
-            without one, or if the description declares the symmetry about it.
+            without one, or if the description declares the symmetry about it. Every declared symmetry keeps the axis
+            or reverses it.
+        order: how many declared symmetries turn about the axis: 6 for a hexagonal nut, 1 without any.
     """
 
     T_object_twin: np.ndarray
     share: np.ndarray
     T_object_axis: np.ndarray | None
+    order: int
 
     def rotations_about_axis(self, angles: np.ndarray) -> np.ndarray:
         """(a, 4, 4) rotations by (a,) angles in radians about the axis, in the object's frame; metres.
@@ -78,15 +81,16 @@ def near_symmetries(model: ObjectModel) -> NearSymmetries:
     """The near symmetries of ``model``, computed once per process in about a second."""
     surface, group, axis = _Surface(model), model.symmetry.discrete, model.symmetry.axis
     T = _registered_rotations(surface)
-    T_object_axis = _continuous_axis(T, surface) if axis is None else None
+    T_object_axis, order = _continuous_axis(T, surface, group) if axis is None else None, 1
     if T_object_axis is not None:
         axis = T_object_axis[:3, 2]
+        order = int(np.count_nonzero(group @ axis @ axis > 0))
     T = np.concatenate([np.eye(4)[None], T])
     T, share = _adapted_to_views(T[_distinct(T, group, axis)], model, surface)
-    order = np.append(0, 1 + np.argsort(-share[1:], kind="stable"))
-    order = order[share[order] >= _LEAST_SHARE]
-    order = order[_distinct(T[order], group, axis)][: _MOST + 1]
-    return NearSymmetries(T[order], share[order], T_object_axis)
+    best = np.append(0, 1 + np.argsort(-share[1:], kind="stable"))
+    best = best[share[best] >= _LEAST_SHARE]
+    best = best[_distinct(T[best], group, axis)][: _MOST + 1]
+    return NearSymmetries(T[best], share[best], T_object_axis, order)
 
 
 def telling_surface(
@@ -186,13 +190,19 @@ def _rotation_grid() -> np.ndarray:
     return (frames[:, None] @ about_z).reshape(-1, 3, 3)
 
 
-def _continuous_axis(T: np.ndarray, surface: _Surface) -> np.ndarray | None:
-    """(4, 4) frame whose z is a line about which every rotation is a near symmetry; None without one."""
+def _continuous_axis(T: np.ndarray, surface: _Surface, group: np.ndarray) -> np.ndarray | None:
+    """(4, 4) frame whose z is a line about which every rotation is a near symmetry; None without one.
+
+    Lines that a declared symmetry of (s, 3, 3) ``group`` moves elsewhere are left out: rotations about them and about
+    their images make up all rotations, as of a ball, and no body is left that they keep.
+    """
     best, found = _AXIS_SHARE, None
     points, normals = surface.points[:_FIT_POINTS], surface.normals[:_FIT_POINTS]
     for rotation in T[rotation_angle(T[:, :3, :3], np.eye(3)) > _APART]:
         axis = Rotation.from_matrix(rotation[:3, :3]).as_rotvec()
         axis /= np.linalg.norm(axis)
+        if (np.abs(group @ axis @ axis) < np.cos(_NEIGHBOUR)).any():
+            continue
         # The points that a rotation about a line leaves in place solve (1 - R) x = t.
         point = np.linalg.pinv(np.eye(3) - rotation[:3, :3], rcond=1e-3) @ rotation[:3, 3]
         R = Rotation.from_rotvec(np.outer(_AXIS_ANGLES, axis)).as_matrix()
@@ -200,9 +210,19 @@ def _continuous_axis(T: np.ndarray, surface: _Surface) -> np.ndarray | None:
         coincides = surface.coincides(about_line, points, normals, _AXIS_TOLERANCE, _AXIS_ALIKE)
         if coincides.mean(axis=1).min() > best + 0.01:
             best = coincides.mean(axis=1).min()
+            axis, point = _kept_line(axis, point, group)
             to_axis, _ = Rotation.align_vectors(axis[None], [[0.0, 0.0, 1.0]])
             found = make_transform(to_axis.as_matrix(), point)
     return found
+
+
+def _kept_line(axis: np.ndarray, point: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The line nearest to one along (3,) ``axis`` through (3,) ``point`` that the declared symmetries keep exactly."""
+    if len(group) == 1:
+        return axis, point
+    # The mean over a group is what the group keeps; flips reverse the axis.
+    kept = (np.sign(group @ axis @ axis)[:, None] * (group @ axis)).mean(axis=0)
+    return kept / np.linalg.norm(kept), (group @ point).mean(axis=0)
 
 
 def _adapted_to_views(T: np.ndarray, model: ObjectModel, surface: _Surface) -> tuple[np.ndarray, np.ndarray]:

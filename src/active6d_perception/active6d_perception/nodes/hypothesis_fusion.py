@@ -98,12 +98,15 @@ class HypothesisFusionNode(GraphNode):
             "correct the camera's poses by aligning the depth images of the views; only by the method all-views",
         )
         self.declare(
-            "cut", usual.cut, "distance at which clusters are cut, as a fraction of the object's diameter", minimum=1e-3
+            "cut",
+            usual.cut,
+            "distance at which clusters are cut, as a fraction of the object's diameter; less for slim objects",
+            minimum=1e-3,
         )
         self.declare(
             "exclusion",
             usual.exclusion,
-            "least distance between two objects, as a fraction of the diameter",
+            "least distance between two objects, as a fraction of the diameter; less for slim objects",
             minimum=0.0,
         )
         self.declare(

@@ -40,7 +40,8 @@ from active6d_perception.scene.rotation_belief import PlaceBeliefs, decide, post
 from active6d_perception.scene.scene_evidence import BodyEvidence, SceneEvidence
 from active6d_perception.suppression import suppress_neighbours
 
-#: An instance whose body's middle is nearer than this to a candidate's is the candidate's own, diameters.
+#: An instance whose body's middle is nearer than this to a candidate's is the candidate's own, fraction of
+#: :attr:`.Ambiguity.spacing`.
 OWN_PLACE = 0.25
 #: Bodies whose middles are farther apart than this do not touch, diameters.
 BESIDE = 1.3
@@ -239,7 +240,7 @@ class AllViewsFusion:
         """The refined bodies that the hypotheses of all views propose, with their twins."""
         known, ambiguity, order = self._known, self.ambiguity, self._order()
         distances = known.distances.take(order, axis=0).take(order, axis=1)
-        labels = cluster(distances, self.parameters.cut * ambiguity.diameter) if len(order) else order
+        labels = cluster(distances, self.parameters.cut * ambiguity.spacing) if len(order) else order
         table = known.table[order]
         squared = confidence(table[:, 0], table[:, 1]) ** 2
         found = gather_candidates(labels, known.T_world_object[order], squared, ambiguity)
@@ -259,7 +260,7 @@ class AllViewsFusion:
             return np.tile(none, (len(keys), 1, 1))
 
         def compute(missing: np.ndarray, view: MeasuredView) -> np.ndarray:
-            place = OWN_PLACE * ambiguity.diameter
+            place = OWN_PLACE * ambiguity.spacing
             return count_cases(
                 rounded[missing], part.rotations, ambiguity.middle, place, part.samples, view, ambiguity.scale
             )
@@ -327,7 +328,7 @@ class AllViewsFusion:
         probability = self._check_container(evidence.bodies.container[beliefs.candidate], probability)
         first = np.argsort(-probability, kind="stable")
         first = first[probability[first] >= self.parameters.least_probability]
-        apart_enough = self.parameters.exclusion * ambiguity.diameter
+        apart_enough = self.parameters.exclusion * ambiguity.spacing
         kept = first[suppress_neighbours(T[first, :3, 3][None], np.ones((1, len(first)), bool), apart_enough)[0]]
         T_camera_anchor = invert(self.cameras.alignment(stamp).correction @ T_world_camera)
         box, depth = project_features(ambiguity.views, T_camera_anchor @ T[kept], camera)
@@ -359,7 +360,7 @@ class AllViewsFusion:
         A twin that no hypothesis is of has the hypothesis with the nearest middle.
         """
         ambiguity = self.ambiguity
-        cut = self.parameters.cut * ambiguity.diameter
+        cut = self.parameters.cut * ambiguity.spacing
         apart = ambiguity.body_distance.between(T_world_object, hypotheses)
         members = apart < cut
         alone = np.flatnonzero(~members.any(axis=1))

@@ -103,8 +103,8 @@ def fit_belief(episodes: Sequence[LabelledPlaces], seed: int = 0) -> tuple[Score
     first = np.cumsum([0, *(episode.place.max(initial=-1) + 1 for episode in episodes)])
     place = np.concatenate([episode.place + start for episode, start in zip(episodes, first, strict=False)])
     # Objects differ in the number of rotations; repeating all of an object's changes none of its probabilities.
-    most = max(episode.right.shape[1] for episode in episodes)
-    repeated = [np.arange(most) % episode.right.shape[1] for episode in episodes]
+    common = np.lcm.reduce([episode.right.shape[1] for episode in episodes])
+    repeated = [np.arange(common) % episode.right.shape[1] for episode in episodes]
     rotations, right = (
         torch.from_numpy(
             np.concatenate([getattr(each, name)[:, turn] for each, turn in zip(episodes, repeated, strict=True)])

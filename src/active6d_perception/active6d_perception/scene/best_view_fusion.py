@@ -11,6 +11,7 @@ from active6d_core.hypotheses import Hypotheses, SceneObjects
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert
 from active6d_perception.compiled import compiled
+from active6d_perception.model.length_scale import spacing
 from active6d_perception.model.model_views import model_views
 from active6d_perception.model.symmetric_distance import SymmetricDistance
 from active6d_perception.scene.clustering import cluster
@@ -77,7 +78,7 @@ class BestViewFusion:
 
     def __init__(self, model: ObjectModel, parameters: FusionParameters | None = None) -> None:
         self.parameters = parameters or FusionParameters()
-        self._diameter = model.diameter
+        self._spacing = spacing(model)
         self._views = model_views(model)
         self._known = HypothesisTable(SymmetricDistance(model).between)
         # Compile now, so that no view has to wait.
@@ -123,9 +124,9 @@ class BestViewFusion:
             return SceneObjects.empty()
         T, table, stamps = known.T_world_object[order], known.table[order], known.stamp[order]
         distance = known.distances.take(order, axis=0).take(order, axis=1)
-        labels = cluster(distance, self.parameters.cut * self._diameter)
+        labels = cluster(distance, self.parameters.cut * self._spacing)
         weight = evidence(table[:, 0], table[:, 1], self.parameters)
-        chosen = select(labels, weight, T[:, :3, 3], self.parameters.exclusion * self._diameter)
+        chosen = select(labels, weight, T[:, :3, 3], self.parameters.exclusion * self._spacing)
         box, depth = project_features(self._views, invert(T_world_camera) @ T[chosen], camera)
         support, spread, seen = summarise(labels, chosen, stamps, distance, stamp)
         box[seen >= 0], depth[seen >= 0] = table[seen[seen >= 0], 2:6], table[seen[seen >= 0], 6]

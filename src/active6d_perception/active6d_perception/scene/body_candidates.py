@@ -7,7 +7,7 @@ import numpy as np
 from active6d_core.se3 import transform_points
 from active6d_perception.model.ambiguity import Ambiguity
 
-#: Bodies whose middles are nearer than this exclude each other, diameters.
+#: Bodies whose middles are nearer than this exclude each other, fraction of :attr:`.Ambiguity.spacing`.
 SAME_PLACE = 0.2
 _DUPLICATE = 0.1  # refined bodies nearer than this are one, diameters
 # Bodies of a place beyond the most evident ones are hardly ever right: with all 100 views there are many.
@@ -61,7 +61,7 @@ def gather_candidates(
     leaders = np.flatnonzero(labels == np.arange(len(labels)))
     leaders = leaders[np.argsort(-gathered[leaders], kind="stable")][:_MOST_CLUSTERS]
     T, gathered = T_world_object[leaders], gathered[leaders]
-    place = number_places(transform_points(T, ambiguity.middle[None])[:, 0], SAME_PLACE * ambiguity.diameter)
+    place = number_places(transform_points(T, ambiguity.middle[None])[:, 0], SAME_PLACE * ambiguity.spacing)
     rank = _rank_within(place)
     kept = rank < _MOST_BODIES
     T, gathered, place, rank = T[kept], gathered[kept], place[kept], rank[kept]

@@ -86,7 +86,7 @@ def tabulate(fusion: AllViewsFusion) -> EvidenceTables:
         "telling": (ambiguity.rotations, ambiguity.telling_samples),
     }
     roots = {name: np.zeros((len(views), len(T), len(R), CASES), np.uint8) for name, (R, _) in parts.items()}
-    near = OWN_PLACE * ambiguity.diameter
+    near = OWN_PLACE * ambiguity.spacing
     for name, (rotations, samples) in parts.items():
         for row, view in zip(roots[name], views, strict=True):
             if samples.number.any():

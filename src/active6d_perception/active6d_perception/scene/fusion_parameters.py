@@ -15,11 +15,15 @@ RANKINGS = ("evidence", "confidence", "verification", "score")
 class FusionParameters:
     """Settings of the fusion.
 
+    Distances that tell objects apart (``cut`` and ``exclusion``) are smaller for slim objects, which can lie nearer to
+    each other than a fifth of their diameter: see :func:`.slimness`, by which both are multiplied.
+
     Attributes:
-        cut: clusters are merged while their mean distance is at most this fraction of the diameter.
-        exclusion: of two objects whose origins are closer than this fraction of the diameter, only the better one is
-            kept. Solid objects cannot share a centre, but a pose that is ambiguous in some views (a mug with a hidden
-            handle) gives several clusters there. 0 keeps all.
+        cut: clusters are merged while their mean distance is at most this fraction of the diameter, less for slim
+            objects.
+        exclusion: of two objects whose origins are closer than this fraction of the diameter, less for slim objects,
+            only the better one is kept. Solid objects cannot share a centre, but a pose that is ambiguous in some views
+            (a mug with a hidden handle) gives several clusters there. 0 keeps all.
         min_verification: hypotheses with a lower verification score are not used. The paper uses all: -1, the default.
         rank_by: the criterion for the best hypothesis of a cluster, and for the best of clusters at one place.
             ``verification`` is equation 1, as in the paper. ``score`` is the estimator's score.
