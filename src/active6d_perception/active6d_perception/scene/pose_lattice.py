@@ -5,7 +5,7 @@ import numpy as np
 from active6d_core.se3 import invert
 from active6d_perception.compiled import compiled
 
-# Steps of a quaternion per metre: rotations are rounded by half a degree where positions are by 0.5 mm.
+# Steps of a quaternion per metre: rotations are rounded by half a degree where positions are by 1 mm.
 _QUATERNION = 1 / 0.256
 
 
