@@ -222,9 +222,14 @@ def test_what_is_no_json_is_named(folder, text):
         BopScene.load(folder)
 
 
-def test_missing_folder_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"nowhere/scene_camera\.json: no such file"):
+def test_missing_folders_are_named(folder, tmp_path):
+    with pytest.raises(ValueError, match="nowhere: no such folder"):
         BopScene.load(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"empty/scene_camera\.json: no such file; a BOP scene folder needs it$"):
+        BopScene.load(tmp_path / "empty")
+    with pytest.raises(ValueError, match=rf"it has \d+ scenes: give one of them, such as {folder.parent}/"):
+        BopScene.load(folder.parent)
 
 
 def test_broken_images_are_named(folder):

@@ -234,6 +234,17 @@ def test_an_axis_that_the_mesh_does_not_have_is_refused(tmp_path, add_bolt):
     assert not [path for path in (tmp_path / "objects").rglob("*") if path.is_file()]
 
 
+def test_an_object_that_looks_round_is_said_to(tmp_path, add_bolt, monkeypatch):
+    added = add_bolt()
+    words = " ".join(added.stdout.split())
+    assert "it looks round about x (1 0 0); if turns about it do not matter, add --axis" in words
+    assert f"to use it: export ACTIVE6D_OBJECT_PATH={tmp_path / 'objects'}" in words
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ACTIVE6D_OBJECT_PATH", raising=False)
+    unknown = " ".join(run("object", "show", "bolt").stderr.split())
+    assert f"to use {tmp_path / 'objects'}: export ACTIVE6D_OBJECT_PATH=" in unknown
+
+
 def test_the_axis_that_the_mesh_has_is_taken(add_bolt):
     assert add_bolt("--axis", "-2", "0", "0").exit_code == 0
 

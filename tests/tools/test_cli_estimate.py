@@ -84,7 +84,7 @@ def test_one_image_gives_the_same_as_its_scene(scene, tmp_path):
     ("arguments", "cause"),
     [
         ([], "give a scene folder"),
-        (["nowhere"], "scene_camera.json: no such file"),
+        (["nowhere"], "nowhere: no such folder"),
         (["SCENE", "--range", "5", "6"], "no depth pixel is inside"),
         (["SCENE", "--range", "2", "1"], "near < far"),
         (["SCENE", "--rgb", "x.png"], "either a scene folder"),

@@ -473,6 +473,18 @@ def test_a_data_set_with_another_mesh_or_frame_is_noticed(dataset, tmp_path):
     assert differs_from_data_set(tmp_path / "test" / "000001", 1, MODEL) == ""
 
 
+def test_a_data_set_without_a_description_of_its_models_is_compared_by_the_mesh(dataset, tmp_path):
+    shutil.copytree(dataset / "models", tmp_path / "models")
+    (tmp_path / "models" / "models_info.json").unlink()
+    scene = tmp_path / "test" / "000003"
+    assert differs_from_data_set(scene, 1, MODEL) == ""
+    moved = replace(MODEL, origin=MODEL.origin + [0.02, 0.0, 0.0])
+    text = differs_from_data_set(scene, 1, moved)
+    assert "their bounds differ by 20 mm" in text
+    assert f"object add {tmp_path / 'models' / 'obj_000001.ply'} --name NAME --scale 0.001" in text
+    assert differs_from_data_set(scene, 2, moved) == ""
+
+
 def recordings(*object_ids):
     """Recordings whose images list these objects; (1, 0.05) is object 1 of which a twentieth is visible."""
     made = []

@@ -148,11 +148,11 @@ def load_object(name: str) -> ObjectModel:
         # A name can come from a bag or a scene: it must not lead to another folder.
         if path.name == f"{name}.yaml" and path.is_file():
             return read_description(path)
-    known = list_objects()
-    raise ValueError(
-        f"unknown object '{name}'{did_you_mean(name, known)}; known: {', '.join(known)} (ACTIVE6D_OBJECT_PATH adds "
-        "folders)"
-    )
+    known, here = list_objects(), Path("objects").resolve()
+    # Objects are added to this folder, which is searched only where the user says so.
+    added = Path(name).name == name and (here / f"{name}.yaml").is_file()
+    hint = f"to use {here}: export ACTIVE6D_OBJECT_PATH={here}" if added else "ACTIVE6D_OBJECT_PATH adds folders"
+    raise ValueError(f"unknown object '{name}'{did_you_mean(name, known)}; known: {', '.join(known)} ({hint})")
 
 
 @np.errstate(all="ignore")

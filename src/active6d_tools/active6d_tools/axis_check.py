@@ -26,19 +26,28 @@ def refuse_wrong_axis(model: ObjectModel) -> None:
     """
     if model.symmetry.axis is None:
         return
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(np.asarray(model.mesh.vertices, np.float32), np.asarray(model.mesh.faces, np.uint32))
-    deviation = _deviation(scene, model, model.symmetry.axis)
-    allowed = _TOLERANCE * model.diameter
+    deviation, allowed = _deviation(_scene(model), model, model.symmetry.axis), _TOLERANCE * model.diameter
     if deviation <= allowed:
         return
-    axes = zip(("x (1 0 0)", "y (0 1 0)", "z (0 0 1)"), np.eye(3), strict=True)
-    fits = [name for name, axis in axes if _deviation(scene, model, axis) <= allowed]
+    fits = axes_of_symmetry(model)
     advice = f"--axis can be {' or '.join(fits)}" if fits else "none of x, y and z is one, so leave --axis out"
     raise ValueError(
         f"--axis is no axis of symmetry: turned about it through the centroid, {1 - _SHARE:.0%} of the surface move by "
         f"{1e3 * deviation:.1f} mm or more, {1e3 * allowed:.1f} mm are allowed; {advice}"
     )
+
+
+def axes_of_symmetry(model: ObjectModel) -> list[str]:
+    """Those of x, y and z about which the mesh can be turned, with the numbers that name them: "x (1 0 0)"."""
+    scene, allowed = _scene(model), _TOLERANCE * model.diameter
+    axes = zip(("x (1 0 0)", "y (0 1 0)", "z (0 0 1)"), np.eye(3), strict=True)
+    return [name for name, axis in axes if _deviation(scene, model, axis) <= allowed]
+
+
+def _scene(model: ObjectModel) -> o3d.t.geometry.RaycastingScene:
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(np.asarray(model.mesh.vertices, np.float32), np.asarray(model.mesh.faces, np.uint32))
+    return scene
 
 
 def _deviation(scene: o3d.t.geometry.RaycastingScene, model: ObjectModel, axis: np.ndarray) -> float:

@@ -56,6 +56,8 @@ def scene_folders(folder: Path) -> list[Path]:
         if several := sorted(folder.glob(f"{depth}{Path(CAMERA_FILE).stem}_*.json")):
             scene = several[0].parent
             raise ValueError(f"{scene / CAMERA_FILE}: no such file{describe_cameras(scene)}")
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder")
     raise ValueError(f"{folder}: no {CAMERA_FILE} in it or in its subfolders; it must be a data set in BOP's format")
 
 
@@ -277,7 +279,10 @@ def _place(
     placed, left_out = register_views(sure, model)
     why = _reasons({recording.image_ids[index]: reason for index, reason in left_out.items()})
     if len(placed) < min(2, len(recording)):
-        raise ValueError(f"{folder}: has no camera poses, and no two images can be placed by their objects: {why}")
+        raise ValueError(
+            f"{folder}: has no camera poses, and no two images can be placed by their objects: {why}; is --object what "
+            "the images show, and is its scale right?"
+        )
     warn(f"{folder.name}: no camera poses; {len(placed)} images are placed by the objects in them")
     if left_out:
         warn(f"{folder.name}: {len(left_out)} of {len(views)} images cannot be placed and are left out: {why}")

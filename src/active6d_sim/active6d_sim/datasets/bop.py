@@ -227,8 +227,11 @@ def _read_by_image(path: Path) -> dict[int, Any]:
     try:
         content = read_json(path)
     except FileNotFoundError as error:
-        several = describe_cameras(path.parent)
-        raise ValueError(f"{path}: no such file; a BOP scene folder needs it{several}") from error
+        folder = path.parent
+        if not folder.is_dir():
+            raise ValueError(f"{folder}: no such folder") from error
+        hint = describe_cameras(folder) or _describe_scenes(folder)
+        raise ValueError(f"{path}: no such file; a BOP scene folder needs it{hint}") from error
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not a JSON file ({error})") from error
     if not isinstance(content, dict) or not all(key.isascii() and key.isdecimal() for key in content):
@@ -240,6 +243,12 @@ def describe_cameras(folder: Path) -> str:
     """What to do where a scene folder has the files of several cameras, ``scene_camera_NAME.json``; else empty."""
     cameras = sorted(each.name for each in folder.glob(f"{Path(CAMERA_FILE).stem}_*.json"))
     return f"; it has {', '.join(cameras)}: copy one camera's files to the usual names" if cameras else ""
+
+
+def _describe_scenes(folder: Path) -> str:
+    """Which folder to give in place of a data set or a split of it; else empty."""
+    scenes = sorted(path.parent for pattern in ("*", "*/*") for path in folder.glob(f"{pattern}/{CAMERA_FILE}"))
+    return f"; it has {len(scenes)} scenes: give one of them, such as {scenes[0]}" if scenes else ""
 
 
 def _read_truth(folder: Path, image_ids: tuple[int, ...]) -> tuple[ImageTruth, ...]:

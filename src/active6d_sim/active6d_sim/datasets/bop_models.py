@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from active6d_core.mesh_file import load_mesh
 from active6d_core.object_model import ObjectModel
 from active6d_core.structured_text import read_json
 
@@ -89,20 +90,22 @@ def differs_from_data_set(scene: Path, object_id: int, model: ObjectModel) -> st
         model: the object whose poses are compared with the data set's.
     """
     folders = [parent / name for parent in list(scene.resolve().parents)[:3] for name in _MODEL_FOLDERS]
-    path = next((folder / INFO_FILE for folder in folders if (folder / INFO_FILE).is_file()), None)
-    if path is None:
-        return ""
+    meshes = [mesh for folder in folders for mesh in sorted(folder.glob(f"obj_{object_id:06d}.*"))]
+    info = next((folder / INFO_FILE for folder in folders if (folder / INFO_FILE).is_file()), None)
     try:
-        entry = read_json(path)[str(object_id)]
-        low = np.array([entry[f"min_{axis}"] for axis in "xyz"], float)
-        bounds = np.array([low, low + [entry[f"size_{axis}"] for axis in "xyz"]])
-    except (KeyError, TypeError, ValueError):  # the scene can be used without
+        if info is not None:
+            entry = read_json(info)[str(object_id)]
+            low = np.array([entry[f"min_{axis}"] for axis in "xyz"], float)
+            bounds = np.array([low, low + [entry[f"size_{axis}"] for axis in "xyz"]])
+        else:
+            bounds = np.asarray(load_mesh(meshes[0]).bounds)
+    except (IndexError, KeyError, TypeError, ValueError):  # the scene can be used without
         return ""
     apart = float(np.abs(bounds - 1e3 * (model.mesh.bounds + model.origin)).max())
     if apart <= _SAME_BOUNDS * 1e3 * model.diameter:
         return ""
-    mesh = path.parent / f"obj_{object_id:06d}.ply"
+    mesh = meshes[0] if meshes else "MESH"
     return (
         f"the mesh of {model.name} is not model {object_id} of this data set, or in another frame: their bounds differ "
-        f"by {apart:.0f} mm, so poses differ too; use `active6d object add {mesh} --scale 0.001`"
+        f"by {apart:.0f} mm, so poses differ too; use `active6d object add {mesh} --name NAME --scale 0.001`"
     )

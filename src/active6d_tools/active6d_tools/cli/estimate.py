@@ -69,7 +69,7 @@ def estimate(
     with messages.status(f"loading the estimator of {object_name}"):
         finder = Active6D(object_name, estimator)
     left_out: list[str] = []
-    _print_model_difference(folder, object_id, finder)
+    estimator = _announce(finder, estimator, folder, object_id)
     crop: dict[str, Any] = {"depth_range": depth_range, "region": box, "region_in_world": region_in_world}
     found = estimate_images(finder, scene_id, images, **crop, sensor=sensor, on_left_out=left_out.append)
     results = _draw_each(found, len(images), Overlay(finder.model), out / "overlays", min_score)
@@ -84,11 +84,17 @@ def estimate(
         raise typer.Exit(1)
 
 
-def _print_model_difference(folder: Path | None, object_id: int, finder: "Active6D") -> None:
+def _announce(finder: "Active6D", estimator: str, folder: Path | None, object_id: int) -> str:
+    """Say what is looked for, and whether the data set has another mesh; the estimator's name where it was chosen."""
+    from active6d_core.registry import AUTOMATIC
+    from active6d_perception.estimators.registry import choose_estimator
     from active6d_sim.datasets.bop_models import differs_from_data_set
 
+    name = choose_estimator(finder.model.name) if estimator == AUTOMATIC else estimator
+    messages.print(f"looking for {finder.model.name} with the estimator {name}", highlight=False, markup=False)
     if folder is not None and (text := differs_from_data_set(folder, object_id, finder.model)):
         messages.print(text, highlight=False, markup=False)
+    return name
 
 
 def _draw_each(
@@ -109,6 +115,9 @@ def _print(results: list["BopEstimates"], min_score: float) -> None:
         sure = int((result.score >= min_score).sum())
         text = f"image {result.image_id:6}  hypotheses {len(result.score):3}  score >= {min_score:g}: {sure:3}"
         console.print(f"{text}  {result.seconds:.2f} s", highlight=False)
+    if results and not any((result.score >= min_score).any() for result in results):
+        why = "is --object what the images show, and are its scale and that of the depth right?"
+        messages.print(f"nothing with a score of {min_score:g} or more; {why}", highlight=False, markup=False)
 
 
 def _read(

@@ -129,6 +129,8 @@ def add(
         notes.append(
             f"the mesh is open at {edges} edges and is used as it is; close it in a mesh editor, such as MeshLab"
         )
+    if model.symmetry.axis is None:
+        notes += _axis_notes(model)
     for note in notes + ([] if known is None else _symmetry_notes(known, model, scale)):
         console.print(note, highlight=False, markup=False)
     _print_added(model, into)
@@ -147,7 +149,16 @@ def _print_added(model: "ObjectModel", into: Path) -> None:
         console.print(line, highlight=False, markup=False)
     folders = os.environ.get("ACTIVE6D_OBJECT_PATH", "").split(os.pathsep)
     if str(into) not in folders and str(into.resolve()) not in folders:
-        console.print(f"export ACTIVE6D_OBJECT_PATH={into.resolve()}", highlight=False, markup=False)
+        command = f"export ACTIVE6D_OBJECT_PATH={into.resolve()}"
+        console.print(f"to use it: {command}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _axis_notes(model: "ObjectModel") -> list[str]:
+    """That an object without an axis of symmetry looks as if it had one."""
+    from active6d_tools.axis_check import axes_of_symmetry
+
+    fits = axes_of_symmetry(model)
+    return [f"it looks round about {' and '.join(fits)}; if turns about it do not matter, add --axis"] if fits else []
 
 
 def _symmetry_notes(known: "ModelSymmetry", model: "ObjectModel", scale: float) -> list[str]:
