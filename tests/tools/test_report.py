@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -97,9 +98,12 @@ def test_confirmed_objects_and_the_wrong_ones_among_them_are_counted():
         # The last object of every step is none of the true ones.
         expected = 1 + (not step.rows[0].detected)
         assert (step.wrong, row["confirmed"], row["wrong"]) == (expected, 2, expected)
-    page = Page(render_html(analysis)).text
+    html = render_html(analysis)
+    page = Page(html).text
     assert f"confirmed 2, {analysis.steps[-1].wrong} wrong" in page
     assert "90 %" in page
+    # Drawn faintly.
+    assert len(re.findall(r'class="object[^"]* doubtful"', html)) == sum(len(step.rows) - 2 for step in analysis.steps)
     bare = analyse(replace(record, steps=steps, ground_truth=None))
     assert bare.steps[-1].wrong is None
     assert "confirmed 2 attends" in Page(render_html(bare)).text
