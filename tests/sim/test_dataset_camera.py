@@ -177,7 +177,7 @@ def test_an_image_that_broke_is_reported_and_the_camera_stays(graph, folder, rec
     ("parameters", "message"),
     [
         ({"scene": ""}, "parameter 'scene' must name the folder"),
-        ({"scene": "/nowhere"}, r"/nowhere/scene_camera\.json: no such file"),
+        ({"scene": "/nowhere"}, r"/nowhere: no such folder"),
         ({"start_view": 3}, "parameter 'start_view' is 3, the last is 2"),
         ({"object_id": -1}, "parameter 'object_id' is -1, must be >= 0"),
     ],
