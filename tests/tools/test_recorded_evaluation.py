@@ -476,6 +476,7 @@ def test_a_data_set_with_another_mesh_or_frame_is_noticed(dataset, tmp_path):
 def test_a_data_set_without_a_description_of_its_models_is_compared_by_the_mesh(dataset, tmp_path):
     shutil.copytree(dataset / "models", tmp_path / "models")
     (tmp_path / "models" / "models_info.json").unlink()
+    (tmp_path / "models" / "obj_000001.jpg").write_bytes(b"a texture")
     scene = tmp_path / "test" / "000003"
     assert differs_from_data_set(scene, 1, MODEL) == ""
     moved = replace(MODEL, origin=MODEL.origin + [0.02, 0.0, 0.0])

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from active6d_core.camera import PinholeCamera, backproject
+from active6d_core.camera import PinholeCamera, View, backproject
 from active6d_core.metrics import match
 from active6d_core.object_model import ObjectModel
 from active6d_core.se3 import invert, look_at, make_transform, transform_points
@@ -210,11 +210,16 @@ def find_bin(scene: BopScene, model: ObjectModel, warn: Callable[[str], None] = 
     T = scene.T_world_camera
     if not looks_down(T):
         raise ValueError(f"{scene.folder}: the cameras do not look down, so the world's z axis is not up")
-    middle = _looked_at(scene)
+    # Evenly spaced.
+    views = [scene.view(index, 0) for index in np.unique(np.linspace(0, len(scene) - 1, 5).astype(int)).tolist()]
+    middle = _looked_at(T, views)
     in_place = np.linalg.norm(middle) < model.diameter
     if in_place:
         middle = np.zeros(3)
-    floor, is_seen = _floor(scene, middle, model)
+    height = _heights(views, middle, model.bin_width / 2)
+    if not len(height):
+        raise ValueError(f"{scene.folder}: no depth where the cameras look, at {np.round(middle, 3).tolist()} m")
+    floor, is_seen = _floor(height)
     if in_place and floor > -_BELOW_FLOOR * model.diameter:
         return T
     if not is_seen:
@@ -224,15 +229,15 @@ def find_bin(scene: BopScene, model: ObjectModel, warn: Callable[[str], None] = 
     return make_transform(np.eye(3), -np.array([middle[0], middle[1], floor])) @ T
 
 
-def _looked_at(scene: BopScene) -> np.ndarray:
-    """(3,) the point nearest to all optical axes; along nearly parallel axes, the depth in their middle decides."""
-    T, seen = scene.T_world_camera, []
-    for index in _some(scene):
-        view = scene.view(index, 0)
+def _looked_at(T: np.ndarray, views: Sequence[View]) -> np.ndarray:
+    """(3,) the point nearest to all optical axes of (m, 4, 4) camera poses; along nearly parallel axes, the depth in
+    the middle of some views decides."""
+    seen = []
+    for view in views:
         rows, columns = (slice(size // 3, -(-2 * size // 3)) for size in view.depth.shape)
         depth = view.depth[rows, columns]
         if np.isfinite(depth).any():
-            seen.append(transform_points(T[index], np.array([[0.0, 0.0, np.nanmedian(depth)]]))[0])
+            seen.append(transform_points(view.T_world_camera, np.array([[0.0, 0.0, np.nanmedian(depth)]]))[0])
     near = np.median(seen, axis=0) if seen else np.zeros(3)
     # Projections onto the planes across the axes.
     across = np.eye(3) - T[:, :3, 2, None] * T[:, None, :3, 2]
@@ -242,26 +247,21 @@ def _looked_at(scene: BopScene) -> np.ndarray:
     return near + direction[:, known] @ ((direction[:, known].T @ off) / strength[known])
 
 
-def _some(scene: BopScene) -> list[int]:
-    """Up to five views, evenly spaced."""
-    return np.unique(np.linspace(0, len(scene) - 1, 5).astype(int)).tolist()
-
-
-def _floor(scene: BopScene, middle: np.ndarray, model: ObjectModel) -> tuple[float, bool]:
-    """Height of what lies under the objects, metres, and whether it is a surface of one height.
-
-    It is near a low quantile of the heights around the middle. Little of the floor is seen between the objects of a
-    pile, but more than of the heights just above it. Where the floor is hidden, it is the other way round.
-    """
+def _heights(views: Sequence[View], middle: np.ndarray, radius: float) -> np.ndarray:
+    """(n,) heights of what views measured within ``radius`` of the vertical line through (3,) ``middle``, metres."""
     heights = []
-    for index in _some(scene):
-        view = scene.view(index, 0)
+    for view in views:
         points = transform_points(view.T_world_camera, backproject(view.depth, view.camera)[np.isfinite(view.depth)])
-        near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < model.bin_width / 2
-        heights.append(points[near, 2])
-    height = np.concatenate(heights)
-    if not len(height):
-        raise ValueError(f"{scene.folder}: no depth where the cameras look, at {np.round(middle, 3).tolist()} m")
+        heights.append(points[np.linalg.norm(points[:, :2] - middle[:2], axis=1) < radius, 2])
+    return np.concatenate(heights)
+
+
+def _floor(height: np.ndarray) -> tuple[float, bool]:
+    """Height of what lies under the objects, of (n,) heights in metres, and whether it is a surface of one height.
+
+    It is near a low quantile of the heights. Little of the floor is seen between the objects of a pile, but more than
+    of the heights just above it. Where the floor is hidden, it is the other way round.
+    """
     off = height - np.quantile(height, 0.01)
     above = np.count_nonzero((off > _FLAT) & (off < 3 * _FLAT))
     near = height[np.abs(off) < _FLAT]

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from active6d_core.mesh_file import load_mesh
+from active6d_core.mesh_limits import SUFFIXES
 from active6d_core.object_model import ObjectModel
 from active6d_core.structured_text import read_json
 
@@ -90,7 +91,9 @@ def differs_from_data_set(scene: Path, object_id: int, model: ObjectModel) -> st
         model: the object whose poses are compared with the data set's.
     """
     folders = [parent / name for parent in list(scene.resolve().parents)[:3] for name in _MODEL_FOLDERS]
-    meshes = [mesh for folder in folders for mesh in sorted(folder.glob(f"obj_{object_id:06d}.*"))]
+    # Textures and materials have the same name.
+    names = [f"obj_{object_id:06d}{suffix}" for suffix in (".ply", *SUFFIXES)]
+    meshes = [folder / name for folder in folders for name in names if (folder / name).is_file()]
     info = next((folder / INFO_FILE for folder in folders if (folder / INFO_FILE).is_file()), None)
     try:
         if info is not None:
