@@ -88,8 +88,7 @@ class SimulatedDriver:
 
     def run_until(self, predicate, frames: int = 200) -> None:
         """Publish frames until the predicate holds."""
-        for publisher in self.publishers:
-            self.graph.spin_until(publisher.get_subscription_count, 5.0, f"a subscriber of {publisher.topic_name}")
+        self.wait_for_subscribers(self.publishers)
         for _ in range(frames):
             self.frame()
             for _ in range(20):
@@ -98,8 +97,13 @@ class SimulatedDriver:
                     return
         raise AssertionError(f"not within {frames} frames")
 
+    def wait_for_subscribers(self, publishers) -> None:
+        """Spin until somebody listens to every one of ``publishers``: a message before that is lost."""
+        for publisher in publishers:
+            self.graph.spin_until(publisher.get_subscription_count, 5.0, f"a subscriber of {publisher.topic_name}")
+
     def run(self, frames: int) -> None:
-        """Publish some frames."""
+        """Publish some frames, whether anybody listens or not."""
         for _ in range(frames):
             self.frame()
             self.graph.spin_for(0.02)

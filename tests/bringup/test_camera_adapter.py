@@ -256,7 +256,6 @@ PROBLEMS = {
 @pytest.mark.parametrize(("traits", "words"), PROBLEMS.values(), ids=PROBLEMS)
 def test_what_is_wrong_is_said_in_words_and_no_view_is_published(graph, traits, words):
     cell = Cell(graph, traits)
-    cell.driver.publishers[:] = []
     for _ in range(400):
         cell.driver.frame()
         graph.spin_for(0.02)
@@ -329,6 +328,7 @@ def test_a_slow_camera_stands_still_by_the_transforms_between_its_images(graph, 
     monkeypatch.setattr(transform_input, "import_optional", lambda name: SimpleNamespace(TFMessage=None))
     cell = Cell(graph, Traits(rate_hz=2.0), parameters={"pose_topic": ""})
     listener = cell.adapter._transforms._source
+    cell.driver.wait_for_subscribers([cell.driver.color, cell.driver.depth, cell.driver.info])
     for _ in range(6):
         for stamp in range(cell.driver.stamp, cell.driver.stamp + SECOND // 2 + 1, SECOND // 100):
             stamped = TransformStamped(
