@@ -23,8 +23,8 @@ demo: setup  ## one episode on a heap of cups: a bag and a report in bags/demo
 results: setup  ## what docs/results.md shows and is not measured yet, except trainings
 	$(BIN)/python -m active6d_tools.results.reproduce
 
-test: setup  ## all tests
-	$(BIN)/python -m pytest tests -n 2 --dist loadfile
+test: setup  ## all tests, in three processes: they wait for nodes most of the time
+	$(BIN)/python -m pytest tests -n 3 --dist loadfile
 
 battery: setup  ## attacks on messages, files, graphs, processes and commands for 20 minutes
 	$(BIN)/python tests/battery --seconds 1200

@@ -13,6 +13,7 @@ from active6d_core.metrics import e_add
 from active6d_core.object_model import ObjectModel, Symmetry, load_object
 from active6d_core.se3 import invert, make_transform
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception import parallel
 from active6d_perception.model.ambiguity import ambiguity_of
 from active6d_perception.scene import all_views_fusion, body_candidates, body_refinement
 from active6d_perception.scene.all_views_fusion import AllViewsFusion
@@ -101,6 +102,15 @@ def fuse(mug, views, weights=None) -> AllViewsFusion:
 
 def objects_of(fusion, view):
     return fusion.objects(view[0], view[1], view[-1])
+
+
+def test_the_number_of_threads_changes_nothing(mug, episode, monkeypatch):
+    found = []
+    for threads in (1, 3):
+        monkeypatch.setattr(parallel, "thread_count", lambda threads=threads: threads)
+        found.append(objects_of(fuse(mug, episode), episode[-1]))
+    np.testing.assert_array_equal(found[0].T_world_object, found[1].T_world_object)
+    np.testing.assert_array_equal(found[0].probability, found[1].probability)
 
 
 def test_all_views_together_know_the_handles(mug, episode):

@@ -58,13 +58,14 @@ def test_a_rendered_pile_is_read_as_training_views(tmp_path):
     assert set(view.instance[view.instance >= 0].tolist()) <= set(range(len(view.T_camera_object)))
 
 
+@pytest.mark.parametrize("name", ["OMP_NUM_THREADS", "NUMBA_NUM_THREADS"])
 @pytest.mark.parametrize("before", [None, "4"])
-def test_the_number_of_threads_is_restored(monkeypatch, before):
+def test_the_number_of_threads_is_restored(monkeypatch, name, before):
     import os
 
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.delenv(name, raising=False)
     if before is not None:
-        monkeypatch.setenv("OMP_NUM_THREADS", before)
+        monkeypatch.setenv(name, before)
     with single_threaded():
-        assert os.environ["OMP_NUM_THREADS"] == "1"
-    assert os.environ.get("OMP_NUM_THREADS") == before
+        assert os.environ[name] == "1"
+    assert os.environ.get(name) == before

@@ -4,6 +4,7 @@ from collections.abc import Callable, Hashable, Sequence
 
 import numpy as np
 
+from active6d_perception.parallel import map_rows
 from active6d_perception.scene.measured_view import MeasuredView
 
 
@@ -25,7 +26,7 @@ class Memo:
 
         Args:
             keys: of k rows.
-            compute: (m,) indices of the keys that are not remembered to their (m, ...) rows.
+            compute: (m,) indices of the keys that are not remembered to their (m, ...) rows; see :func:`.map_rows`.
 
         Returns:
             (k, ...) rows.
@@ -36,7 +37,7 @@ class Memo:
                 new[key] = old[key]
         missing = list({key: index for index, key in enumerate(keys) if key not in new}.values())
         if missing or not len(keys):
-            rows = compute(np.array(missing, np.intp))
+            rows = map_rows(compute, [(np.array(missing, np.intp),)])[0]
             if not len(keys):
                 return rows
             new.update(zip((keys[index] for index in missing), rows, strict=True))
@@ -72,7 +73,7 @@ class ViewSums:
 
         Args:
             keys: of k rows.
-            compute: (m,) indices of keys and a view to their (m, ...) rows there.
+            compute: (m,) indices of keys and a view to their (m, ...) rows there; see :func:`.map_rows`.
             zero: (...) sum over no view; its shape and type are those of the sums.
 
         Returns:
@@ -85,9 +86,11 @@ class ViewSums:
         covered = np.array([count for count, _ in known], np.intp)
         index = np.full(len(number), -1)
         index[of_key[::-1]] = np.arange(len(keys))[::-1]
-        for place in range(int(covered.min(initial=len(self._views))), len(self._views)):
-            rows = np.flatnonzero(covered <= place)
-            total[rows] += compute(index[rows], self._views[place])
+        places = range(int(covered.min(initial=len(self._views))), len(self._views))
+        missing = [np.flatnonzero(covered <= place) for place in places]
+        tasks = [(index[rows], self._views[place]) for place, rows in zip(places, missing, strict=True)]
+        for rows, values in zip(missing, map_rows(compute, tasks), strict=True):
+            total[rows] += values
         for key, row in number.items():
             self._new[key] = len(self._views), total[row]
         return total[of_key]
