@@ -76,6 +76,13 @@ def test_bad_parameters_are_named(graph, overrides, text):
         DepthNode(context=graph.context, overrides=overrides)
 
 
+def test_a_mistyped_parameter_is_named(graph):
+    log = graph.log()
+    graph.add(DepthNode(context=graph.context, overrides={"gian": 2.0, "use_sim_time": False, "mode": "max"}))
+    expected = "parameter 'gian' is unknown and has no effect, did you mean 'gain'?"
+    graph.spin_until(lambda: [line.msg for line in log if "unknown" in line.msg] == [expected])
+
+
 def test_limits_are_descriptor_ranges(graph):
     node = graph.add(DepthNode(context=graph.context), start=False)
     (gain,) = node.describe_parameter("gain").floating_point_range

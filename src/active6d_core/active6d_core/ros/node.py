@@ -148,6 +148,8 @@ class GraphNode(DiagnosticNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run :meth:`setup` with the parameters as they are now."""
         self._configured = True
+        for sentence in self.unknown_parameters():
+            self.say_once(sentence)
         self._read_frames()
         result = self._attempt(self.setup)
         self._configured = result == TransitionCallbackReturn.SUCCESS

@@ -16,6 +16,7 @@ from rclpy.exceptions import (
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 
+from active6d_core.nearest_name import did_you_mean
 from active6d_core.se3 import transform_from_quaternion
 from active6d_core.structured_text import parse_yaml
 
@@ -132,6 +133,15 @@ class ParameterNode(LifecycleNode):
         """The value of a declared parameter; arrays are lists."""
         value = self.get_parameter(name).value
         return value.tolist() if hasattr(value, "tolist") else value
+
+    def unknown_parameters(self) -> list[str]:
+        """A sentence for each value that was given when the node started and that no parameter of it takes."""
+        known = set(self._parameters)
+        return [
+            f"parameter '{name}' is unknown and has no effect{did_you_mean(name, known)}"
+            for name in self._parameter_overrides
+            if name not in known and not name.startswith("qos_overrides.")
+        ]
 
     def rigid_transform(self, name: str) -> np.ndarray:
         """(4, 4) transform of a parameter that holds x y z in metres and the quaternion qx qy qz qw.
