@@ -165,3 +165,15 @@ def test_views_add_up_in_any_order_and_are_forgotten(heap):
     np.testing.assert_array_equal(
         everything, last.grid.centres[last.grid.observe(views[2].depth, views[2].camera, views[2].T_world_camera)]
     )
+
+
+def test_objects_in_the_world_explain_views_in_a_frame_beside_it(heap):
+    """As objects in the frame of the views do, whose centres are then moved to the world."""
+    scene, views = heap
+    surface, known = ObservedSurface(load_object("coffee_cup")), scene.T_world_object[4:]
+    add(surface, views)
+    T_world_anchor = make_transform(Rotation.from_euler("z", 5, degrees=True).as_matrix(), [0.03, -0.02, 0.01])
+    left = surface.unexplained(known)
+    found = surface.unexplained(T_world_anchor @ known, T_world_anchor)
+    np.testing.assert_allclose(found, left @ T_world_anchor[:3, :3].T + T_world_anchor[:3, 3], atol=1e-9)
+    assert len(surface.unexplained(known, T_world_anchor)) > len(left) > 0

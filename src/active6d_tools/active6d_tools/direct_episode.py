@@ -113,13 +113,14 @@ class DirectRunner:
             view = seen.view
             pose, found = view.T_world_camera, (seen.hypotheses, seen.verification)
             fusion.add_view(view.stamp, pose, *found, view.depth, view.camera)
-            surface.add_view(view.stamp, view.depth, view.camera, pose)
+            corrected = fusion.cameras.alignment(view.stamp).correction @ pose
+            surface.add_view(view.stamp, view.depth, view.camera, corrected)
             shown = pose if seen.T_world_shown is None else seen.T_world_shown
             objects = fusion.objects(view.stamp, shown, view.camera)
             episode.views.append(seen)
             episode.objects.append(objects)
             state.add_view(view.stamp, view.T_world_camera[:3, 3])
-            unexplained = surface.unexplained(objects.T_world_object)
+            unexplained = surface.unexplained(objects.T_world_object, fusion.cameras.T_world_anchor)
             reached = None
             while reached is None:
                 decision, episode.reason = state.decide(policy, objects, unexplained)

@@ -32,7 +32,6 @@ from active6d_core.ros.node import GraphNode
 from active6d_core.ros.optional_outputs import DetectionOutput
 from active6d_core.ros.runner import run_node
 from active6d_core.ros.view_inputs import ViewInputs
-from active6d_core.se3 import invert, transform_points
 from active6d_perception.scene.all_views_fusion import AllViewsFusion
 from active6d_perception.scene.best_view_fusion import BestViewFusion
 from active6d_perception.scene.camera_alignment import CameraAlignment
@@ -269,9 +268,7 @@ class HypothesisFusionNode(GraphNode):
         confirmed = self._settings.confirmed
         shown = objects if self._mesh_uri else SceneObjects.empty()
         self._markers.publish(objects_to_markers(shown, self._mesh_uri, stamp, self.world_frame, confirmed))
-        T_world_anchor = self._cameras.T_world_anchor
-        unexplained = self._surface.unexplained(invert(T_world_anchor) @ objects.T_world_object)
-        unexplained = transform_points(T_world_anchor, unexplained)
+        unexplained = self._surface.unexplained(objects.T_world_object, self._cameras.T_world_anchor)
         self._unexplained.publish(points_to_cloud(unexplained, stamp, self.world_frame))
         self._camera_poses.publish(poses_to_array(self._cameras.T_world_cameras(), stamp, self.world_frame))
         self._detections.publish(objects, self._model, stamp, self.world_frame)

@@ -14,6 +14,7 @@ import numpy as np
 from active6d_core.camera import PinholeCamera, pixel_rays, project
 from active6d_core.episode_views import views_from
 from active6d_core.object_model import ObjectModel
+from active6d_core.se3 import invert, transform_points
 from active6d_perception.compiled import compiled
 from active6d_perception.model.model_views import ray_caster
 
@@ -237,8 +238,14 @@ class ObservedSurface:
         """Forget the views that were added before the one of ``stamp`` (nanoseconds); all without that one."""
         self._seen = views_from(self._seen, stamp)
 
-    def unexplained(self, T_world_object: np.ndarray) -> np.ndarray:
-        """(k, 3) centres of the unexplained cells: seen, and not near any of (n, 4, 4) poses; world, metres."""
+    def unexplained(self, T_world_object: np.ndarray, T_world_anchor: np.ndarray | None = None) -> np.ndarray:
+        """(k, 3) centres of the unexplained cells: seen, and not near any of (n, 4, 4) poses; world, metres.
+
+        (4, 4) ``T_world_anchor`` is from the frame in which views were added to the world, see
+        :attr:`.CameraAlignment.T_world_anchor`; the identity when None.
+        """
+        anchor = np.eye(4) if T_world_anchor is None else T_world_anchor
         seen = np.logical_or.reduce([np.zeros(len(self.grid), bool), *self._seen.values()])
         points = self.grid.centres[seen]
-        return points[~self._explainer.explains(points, T_world_object).any(axis=0)]
+        explained = self._explainer.explains(points, invert(anchor) @ T_world_object)
+        return transform_points(anchor, points[~explained.any(axis=0)])
