@@ -77,8 +77,9 @@ def ablate(
     verification score against the estimator's score. [bold]fusion[/bold]: with clustering and without.
     [bold]signs[/bold]: signs of the reward, inverted and as the paper prints them. [bold]planning[/bold]: parameters
     of the default policy, without training. [bold]noise-resampling[/bold]: the same views with other sensor noise,
-    from a second bank (active6d bank --split test --seed 1). [bold]seeds[/bold]: trainings of both learned
-    policies. [bold]paper[/bold]: trainings in the paper's length, for hours. Missing trainings start, begun ones go on.
+    from a second bank (active6d bank --split test --seed 1). [bold]seeds[/bold]: trainings of the learned policies
+    among --policies, else of both. [bold]paper[/bold]: trainings in the paper's length, for hours. Missing trainings
+    start, begun ones go on.
 
     Example: [bold]active6d ablate steps --object mug --json steps.json --png steps.png[/bold]
     """
@@ -100,7 +101,7 @@ def ablate(
     if part in _TRAINED:
         rows = _train_variants(part, lookups, _folder(out, "ablations", object_name), steps, length, starts, seed)
     elif part in (Part.SEEDS, Part.PAPER):
-        trained = LEARNED if part is Part.SEEDS else (PAPER,)
+        trained = (PAPER,) if part is Part.PAPER else tuple(name for name in LEARNED if name in names) or LEARNED
         weights = _train_seeds(trained, seeds, lookups["val"], _folder(out, "policies", object_name), steps, banks)
         rows = _compare_seeds(lookups, weights, starts, steps, sample, seed)
     else:
