@@ -21,6 +21,7 @@ from active6d_core.hypotheses import Hypotheses
 from active6d_core.object_model import load_object
 from active6d_core.se3 import invert, look_at, make_transform, rotation_angle
 from active6d_perception.estimators.registry import register_estimator
+from active6d_perception.scene import camera_alignment
 from active6d_sim.datasets.bop import BopScene, ImageTruth, write_bop_scene
 from active6d_sim.datasets.bop_export import write_model
 from active6d_sim.datasets.bop_models import differs_from_data_set
@@ -162,6 +163,16 @@ def test_scenes_without_camera_poses_are_placed_by_their_objects(dataset, tmp_pa
     result = run("--bop", copy, "--policies", "random")
     assert result.exit_code == 2
     assert "11 of 12 images have no camera pose" in result.output
+
+
+def test_images_that_fit_no_other_are_named(dataset, monkeypatch):
+    options = "--bop", dataset, "--policies", "random", "--steps", 3, "--starts", 1
+    assert "could not be aligned" not in run(*options).output
+    alone = camera_alignment.Alignment(np.eye(4), aligned=False)
+    monkeypatch.setattr(camera_alignment, "_align", lambda *arguments: alone)
+    words = " ".join(run(*options).output.split())
+    assert "random: 3 views, of 3 images (such as 000003/" in words
+    assert "could not be aligned by their depth with those before them; there, the given camera poses" in words
 
 
 def show_something_else(path):

@@ -78,12 +78,14 @@ class DirectEpisode:
     Attributes:
         views: t + 1 in order.
         objects: t + 1, what was known after each view.
+        not_aligned: numbers of the views whose depth images fit none before; their camera poses are as given.
         refused: why goals were refused, in order.
         reason: why it ended.
     """
 
     views: list[PerceivedView] = field(default_factory=list)
     objects: list[SceneObjects] = field(default_factory=list)
+    not_aligned: list[int] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     reason: str = ""
 
@@ -113,8 +115,10 @@ class DirectRunner:
             view = seen.view
             pose, found = view.T_world_camera, (seen.hypotheses, seen.verification)
             fusion.add_view(view.stamp, pose, *found, view.depth, view.camera)
-            corrected = fusion.cameras.alignment(view.stamp).correction @ pose
-            surface.add_view(view.stamp, view.depth, view.camera, corrected)
+            aligned = fusion.cameras.alignment(view.stamp)
+            if not aligned.aligned:
+                episode.not_aligned.append(len(episode.views))
+            surface.add_view(view.stamp, view.depth, view.camera, aligned.correction @ pose)
             shown = pose if seen.T_world_shown is None else seen.T_world_shown
             objects = fusion.objects(view.stamp, shown, view.camera)
             episode.views.append(seen)

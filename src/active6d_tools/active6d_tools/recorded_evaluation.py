@@ -1,5 +1,6 @@
 """Policies on scenes recorded in BOP's format: which scenes, from which starts, and how they score."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -96,7 +97,7 @@ class RecordedEvaluation:
         seed: int = 0,
         warn: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._model, self._steps, self._seed = model, steps, seed
+        self._model, self._steps, self._seed, self._warn = model, steps, seed, warn
         # A recording tells where its floor is, but not whether there are walls.
         self._fusion = AllViewsFusion(model, tray=OPEN_TABLE)
         perception = Perception(model, estimator)
@@ -145,7 +146,7 @@ class RecordedEvaluation:
             The scores, with BOP's image numbers as views; and for each episode the objects in the camera of its last
             image.
         """
-        rows, estimates = [], []
+        rows, estimates, not_aligned = [], [], Counter[str]()
         for done, (number, start) in enumerate(self.starts.tolist()):
             scene = self.scenes[number]
             on_progress(f"{name}, {scene.recording.folder.name}", done, len(self.starts))
@@ -155,8 +156,18 @@ class RecordedEvaluation:
             limits = Limits(scene.sphere, scene.allowed, self._steps)
             runner = DirectRunner(self._model, limits, self._fusion)
             episode = runner.run(policy, camera, np.random.default_rng([self._seed, number, start]))
+            not_aligned.update(
+                f"{scene.recording.folder.name}/{scene.recording.image_ids[camera.taken[index]]}"
+                for index in episode.not_aligned
+            )
             rows.append(self._score(number, episode, camera))
             estimates.append(_estimates(scene, self._numbers[number], episode, camera))
+        if not_aligned:
+            named = ", ".join(name for name, _ in not_aligned.most_common(_NAMED))
+            self._warn(
+                f"{name}: {not_aligned.total()} views, of {len(not_aligned)} images (such as {named}), could not be "
+                "aligned by their depth with those before them; there, the given camera poses were used"
+            )
         return EpisodeResults(self.starts[:, 0], *map(np.array, zip(*rows, strict=True))), estimates
 
     def _score(self, number: int, episode: DirectEpisode, camera: RecordedCamera) -> tuple[Any, ...]:
