@@ -171,6 +171,20 @@ def test_an_error_beyond_reach_is_reported_and_not_corrected(measured):
     assert not cameras.alignment(1).aligned
 
 
+@pytest.mark.parametrize("metres", [0.15, 0.25, 0.4])
+def test_a_pose_that_nothing_confirms_is_reported_whichever_way_it_is_off(measured, metres):
+    """Some pixels always find a pair; they are not enough to take a pose, given or corrected, for right."""
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        cameras, direction = CameraAlignment(), rng.normal(size=3)
+        for index, view in enumerate(measured[:5]):
+            cameras.add_view(index, view)
+        off = make_transform(np.eye(3), metres * direction / np.linalg.norm(direction))
+        moved = cameras.add_view(5, move_view(measured[5], off @ invert(measured[5].T_camera_world)))
+        assert not cameras.alignment(5).aligned
+        np.testing.assert_allclose(invert(moved.T_camera_world), off @ invert(measured[5].T_camera_world), atol=1e-12)
+
+
 def test_forgotten_views_hold_nothing(measured):
     wrong = wrong_poses(measured, PoseError(6.0, 0.5), 5)
     cameras, fresh = CameraAlignment(), CameraAlignment()

@@ -35,6 +35,8 @@ _STARTS = 0.015 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
 _LARGE, _FEW = 0.008, 0.7
 # Another correction, or none, is only given up for one with this much more of the pairs.
 _BETTER = 0.04
+# A pose with less of the pairs is not confirmed: right ones have .36 or more, or none where views share no surface.
+_LEAST_SHARE = 0.25
 # Surfaces are sampled evenly over the directions of their normals: those of the faces, edges and corners of a cube.
 _DIRECTIONS = np.array([each for each in product((-1.0, 0.0, 1.0), repeat=3) if any(each)])
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
@@ -211,10 +213,10 @@ def _align(points: np.ndarray, normals: np.ndarray, near: list[MeasuredView]) ->
         if more > share + _BETTER:
             correction, share = other, more
     before = _step(points, normals, near, _GATES[-1])
-    if before is not None and share < before[1] + _BETTER:
+    if before is not None and before[1] > max(share - _BETTER, _LEAST_SHARE):
         return _AS_GIVEN
     shift, turn = _moved(points, correction), Rotation.from_matrix(correction[:3, :3]).magnitude()
-    if share == 0 or shift > _LARGEST_SHIFT or turn > _LARGEST_TURN:
+    if share < _LEAST_SHARE or shift > _LARGEST_SHIFT or turn > _LARGEST_TURN:
         return Alignment(np.eye(4), aligned=False)
     return Alignment(correction, shift)
 
