@@ -55,6 +55,7 @@ def make_record(
                 Hypotheses.empty(120, 160),
                 make_objects(T, verification),
                 np.zeros((0, 3)),
+                None,
                 None if last else np.full(len(T), 1 / len(T)),
                 None if last else len(T) - 1,
                 None,

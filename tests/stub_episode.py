@@ -25,6 +25,7 @@ class StubStep:
     hypotheses: Hypotheses
     objects: SceneObjects
     unexplained: np.ndarray
+    T_world_corrected: np.ndarray
     attention: np.ndarray
     attended: int
     goal: np.ndarray
@@ -78,6 +79,7 @@ class StubEpisode:
             ("objects/poses", conversions.poses_to_array(step.objects.T_world_object, stamp, self.world)),
             ("objects/markers", conversions.objects_to_markers(step.objects, "package://x/mug.obj", stamp, self.world)),
             ("objects/unexplained", conversions.points_to_cloud(step.unexplained, stamp, self.world)),
+            ("objects/camera_poses", conversions.poses_to_array(step.T_world_corrected[None], stamp, self.world)),
             ("/diagnostics", _status(stamp, "view processed", latency_ms="12.500", views="1")),
         ]
 
@@ -108,7 +110,10 @@ def _step(rng: np.random.Generator, stamp: int, T_world_camera: np.ndarray, goal
     color = rng.integers(0, 256, (*depth.shape, 3)).astype(np.uint8)
     view = View(stamp, color, depth, CAMERA, T_world_camera)
     attention, attended = rng.random(count), int(rng.integers(count))
-    return StubStep(view, hypotheses, objects, rng.uniform(-0.2, 0.2, (7, 3)), attention, attended, goal)
+    corrected = T_world_camera.copy()
+    corrected[:3, 3] += 0.005
+    unexplained = rng.uniform(-0.2, 0.2, (7, 3))
+    return StubStep(view, hypotheses, objects, unexplained, corrected, attention, attended, goal)
 
 
 def _poses(rng: np.random.Generator, count: int) -> np.ndarray:

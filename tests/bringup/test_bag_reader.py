@@ -49,6 +49,7 @@ def test_episode_is_read_back(tmp_path):
         assert_table(read.hypotheses, sent.hypotheses)
         assert_table(read.objects, sent.objects)
         np.testing.assert_allclose(read.unexplained, sent.unexplained, atol=1e-7)
+        np.testing.assert_allclose(read.T_world_camera, sent.T_world_corrected, atol=1e-12)
         assert read.latency_ms == {"pose_estimator": 12.5}
     for read, sent in zip(record.steps[:-1], episode.steps[:-1], strict=True):
         np.testing.assert_allclose(read.goal, sent.goal, atol=1e-12)
@@ -75,17 +76,21 @@ def test_namespace_and_frame_are_the_bags_own(tmp_path):
 
 
 def test_recording_cut_off_in_the_middle_keeps_its_views(tmp_path):
-    record = read_episode(write_bag(tmp_path / "bag", StubEpisode().messages()[:21]))
+    record = read_episode(write_bag(tmp_path / "bag", StubEpisode().messages()[:22]))
     assert record.end_reason is None
     assert [step.objects is None for step in record.steps] == [False, True]
     assert record.steps[1].hypotheses is None
 
 
-def test_a_bag_of_before_the_unexplained_surface_is_read(tmp_path):
-    messages = [item for item in StubEpisode().messages() if item[0] != "objects/unexplained"]
+def test_a_bag_without_topics_of_later_versions_is_read(tmp_path):
+    later = ("objects/unexplained", "objects/camera_poses")
+    messages = [item for item in StubEpisode().messages() if item[0] not in later]
     record = read_episode(write_bag(tmp_path / "bag", messages))
     assert len(record.steps) == 3
-    assert all(step.unexplained is None and len(step.objects) for step in record.steps)
+    for step in record.steps:
+        assert step.unexplained is None
+        assert len(step.objects)
+        np.testing.assert_array_equal(step.T_world_camera, step.view.T_world_camera)
 
 
 def test_camera_alone_is_an_episode(tmp_path):

@@ -175,5 +175,17 @@ def test_objects_in_the_world_explain_views_in_a_frame_beside_it(heap):
     T_world_anchor = make_transform(Rotation.from_euler("z", 5, degrees=True).as_matrix(), [0.03, -0.02, 0.01])
     left = surface.unexplained(known)
     found = surface.unexplained(T_world_anchor @ known, T_world_anchor)
-    np.testing.assert_allclose(found, left @ T_world_anchor[:3, :3].T + T_world_anchor[:3, 3], atol=1e-9)
+    moved = left @ T_world_anchor[:3, :3].T + T_world_anchor[:3, 3]
+    np.testing.assert_allclose(found, moved[surface.grid.holds(moved)], atol=1e-9)
     assert len(surface.unexplained(known, T_world_anchor)) > len(left) > 0
+
+
+def test_nothing_is_unexplained_beside_the_workspace(heap):
+    """Cells that the correction of the cameras moves below the workspace, such as those of the floor, are left out."""
+    surface = ObservedSurface(load_object("coffee_cup"))
+    add(surface, heap[1])
+    none, down = np.zeros((0, 4, 4)), make_transform(np.eye(3), [0.0, 0.0, -0.05])
+    every, left = surface.unexplained(none), surface.unexplained(none, down)
+    expected = every[every[:, 2] - 0.05 >= surface.grid.floor]
+    np.testing.assert_allclose(left, expected - [0.0, 0.0, 0.05], atol=1e-9)
+    assert 0 < len(left) < len(every)

@@ -16,9 +16,9 @@ from recorded_mugs import CAMERA, OFFSETS, make_record
 from active6d_bringup.bags.reader import EpisodeRecord, RecordedStep
 from active6d_core.camera import PinholeCamera
 from active6d_core.object_model import ObjectModel, Symmetry
-from active6d_core.se3 import make_transform
+from active6d_core.se3 import invert, make_transform
 from active6d_tools.report.analysis import analyse
-from active6d_tools.report.drawing import ScoreScale, depth_to_color
+from active6d_tools.report.drawing import ScoreScale, depth_to_color, outline_step
 from active6d_tools.report.figure import render_png
 from active6d_tools.report.html_page import render_html
 from active6d_tools.report.silhouette import SilhouetteDrawer
@@ -107,6 +107,37 @@ def test_confirmed_objects_and_the_wrong_ones_among_them_are_counted():
     bare = analyse(replace(record, steps=steps, ground_truth=None))
     assert bare.steps[-1].wrong is None
     assert "confirmed 2 attends" in Page(render_html(bare)).text
+
+
+@pytest.mark.parametrize(
+    ("settings", "threshold"), [({}, 0.5), ({"confirmed": 0.8}, 0.8), ({"confirmed": "high"}, 0.5)]
+)
+def test_the_threshold_is_that_of_the_recording(settings, threshold):
+    record = replace(make_record(), settings={"hypothesis_fusion": settings})
+    analysis = analyse(record)
+    for step in analysis.steps:
+        assert len(step.confirmed) == np.count_nonzero(step.objects.probability >= threshold)
+    assert f"at least {100 * threshold:.0f} %" in render_html(analysis)
+
+
+def test_objects_are_drawn_in_the_corrected_camera():
+    """A camera 10 cm to the side of where it was said to be shows an object that is not in its picture's middle."""
+    record = make_record()
+    step = record.steps[0]
+    aside = step.view.T_world_camera @ make_transform(np.eye(3), np.array([0.1, 0.0, 0.0]))
+    drawer = SilhouetteDrawer(analyse(record).model)
+
+    def centres(corrected):
+        steps = [replace(step, T_world_corrected=corrected), *record.steps[1:]]
+        analysis = analyse(replace(record, steps=steps))
+        outlines = outline_step(drawer, analysis.steps[0], None).objects
+        return {number: outline.center for number, outline in enumerate(outlines) if outline.center is not None}
+
+    depth = (invert(step.view.T_world_camera) @ step.objects.T_world_object)[:, 2, 3]
+    given, corrected = centres(None), centres(aside)
+    assert given.keys() & corrected.keys()
+    for number in given.keys() & corrected.keys():
+        assert given[number][0] - corrected[number][0] == pytest.approx(CAMERA.fx * 0.1 / depth[number], abs=2.0)
 
 
 def test_analysis_takes_the_median_time_of_each_node():

@@ -78,6 +78,7 @@ class DirectEpisode:
     Attributes:
         views: t + 1 in order.
         objects: t + 1, what was known after each view.
+        T_world_cameras: (t + 1, 4, 4) poses of the camera as fusion corrected them by the end, metres.
         not_aligned: numbers of the views whose depth images fit none before; their camera poses are as given.
         refused: why goals were refused, in order.
         reason: why it ended.
@@ -85,6 +86,7 @@ class DirectEpisode:
 
     views: list[PerceivedView] = field(default_factory=list)
     objects: list[SceneObjects] = field(default_factory=list)
+    T_world_cameras: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
     not_aligned: list[int] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     reason: str = ""
@@ -123,6 +125,7 @@ class DirectRunner:
             objects = fusion.objects(view.stamp, shown, view.camera)
             episode.views.append(seen)
             episode.objects.append(objects)
+            episode.T_world_cameras = fusion.cameras.T_world_cameras()
             state.add_view(view.stamp, view.T_world_camera[:3, 3])
             unexplained = surface.unexplained(objects.T_world_object, fusion.cameras.T_world_anchor)
             reached = None

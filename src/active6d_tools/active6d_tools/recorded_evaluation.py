@@ -255,7 +255,7 @@ def _estimates(scene: RecordedScene, number: int, episode: DirectEpisode, camera
     return BopEstimates(
         number,
         scene.recording.image_ids[index],
-        invert(scene.T_bin_camera[index]) @ objects.T_world_object,
+        invert(episode.T_world_cameras[-1]) @ objects.T_world_object,
         objects.probability,
         sum(seen.seconds for seen in episode.views),
     )

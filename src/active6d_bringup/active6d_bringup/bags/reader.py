@@ -36,6 +36,7 @@ from active6d_core.ros.conversions import (
 from active6d_core.ros.episode_messages import EpisodeEnd, EpisodeStart, episode_info
 from active6d_core.ros.topics import (
     CAMERA_POSE,
+    CAMERA_POSES,
     CAMERA_TOPICS,
     DIAGNOSTICS,
     EPISODE_END,
@@ -54,6 +55,7 @@ class RecordedStep:
         hypotheses: of this view, in the camera's frame, with ``hypotheses.segmentation``.
         objects: everything accumulated up to this view, in the world.
         unexplained: (k, 3) places of the surface that is of none of the objects, in the world, metres.
+        T_world_corrected: (4, 4) pose of the camera as fusion corrected it after this view.
         attention: (n,) weight per object.
         attended: index of the attended object.
         goal: ``T_world_camera`` (4, 4) that the policy asked for next.
@@ -64,6 +66,7 @@ class RecordedStep:
     hypotheses: Hypotheses | None = None
     objects: SceneObjects | None = None
     unexplained: np.ndarray | None = None
+    T_world_corrected: np.ndarray | None = None
     attention: np.ndarray | None = None
     attended: int | None = None
     goal: np.ndarray | None = None
@@ -73,6 +76,11 @@ class RecordedStep:
     def stamp(self) -> int:
         """Nanoseconds."""
         return self.view.stamp
+
+    @property
+    def T_world_camera(self) -> np.ndarray:
+        """(4, 4) pose of the camera that the objects are consistent with: the corrected one, else the given one."""
+        return self.view.T_world_camera if self.T_world_corrected is None else self.T_world_corrected
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +95,7 @@ class EpisodeRecord:
         end_reason: why the policy stopped, None if the recording was cut off before.
         world_frame: name of the world's frame.
         damage: what is missing or damaged in the bag, in words.
+        settings: node name to its parameters when recording; empty where the bag does not have them.
     """
 
     folder: Path
@@ -96,6 +105,7 @@ class EpisodeRecord:
     end_reason: str | None
     world_frame: str
     damage: tuple[str, ...] = ()
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @property
     def object(self) -> str | None:
@@ -198,6 +208,7 @@ def _episode(
         end_reason=ended[-1].reason if ended else None,
         world_frame=world,
         damage=index.damage,
+        settings=index.settings,
     )
 
 
@@ -212,7 +223,7 @@ def _step(messages: dict[str, dict[int, Any]], latency_ms: dict[str, float], sta
     with refusing():
         color, camera = image_to_color(at["camera/color/image_raw"]), info_to_camera(at["camera/color/camera_info"])
         view = View(stamp, color, depth, camera, T_world_camera)
-    hypotheses = objects = unexplained = attention = attended = goal = None
+    hypotheses = objects = unexplained = corrected = attention = attended = goal = None
     if "hypotheses" in at and "hypotheses/segmentation" in at:
         segmentation = image_to_segmentation(at["hypotheses/segmentation"])
         hypotheses = hypotheses_from_cloud(at["hypotheses"], segmentation, message.header.frame_id)
@@ -220,8 +231,11 @@ def _step(messages: dict[str, dict[int, Any]], latency_ms: dict[str, float], sta
         objects = objects_from_cloud(at["objects"], world)
     if "objects/unexplained" in at:
         unexplained = points_from_cloud(at["objects/unexplained"], world)
+    if CAMERA_POSES.name in at:
+        poses = poses_from_array(at[CAMERA_POSES.name], world)
+        corrected = poses[-1] if len(poses) else None
     if "attention" in at:
         attention, attended = attention_from_cloud(at["attention"], world)
     if "view_goal" in at:
         goal = pose_stamped_to_transform(at["view_goal"], world)
-    return RecordedStep(view, hypotheses, objects, unexplained, attention, attended, goal, latency_ms)
+    return RecordedStep(view, hypotheses, objects, unexplained, corrected, attention, attended, goal, latency_ms)

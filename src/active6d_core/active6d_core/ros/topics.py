@@ -82,6 +82,7 @@ OBJECTS = Topic("objects", _TABLE, Per.VIEW, _FUSION)
 OBJECTS_POSES = Topic("objects/poses", _POSES, Per.VIEW, _FUSION)
 OBJECTS_MARKERS = Topic("objects/markers", "visualization_msgs/msg/MarkerArray", Per.VIEW, _FUSION)
 UNEXPLAINED = Topic("objects/unexplained", _TABLE, Per.VIEW, _FUSION)
+CAMERA_POSES = Topic("objects/camera_poses", _POSES, Per.VIEW, _FUSION)
 ATTENTION = Topic("attention", _TABLE, Per.MOVE, _POLICY, transient_local=False)
 VIEW_GOAL = Topic("view_goal", _POSE, Per.MOVE, _POLICY, transient_local=False)
 # An arm's node refuses what it cannot plan.
@@ -103,6 +104,7 @@ CONTRACT = (
     OBJECTS_POSES,
     OBJECTS_MARKERS,
     UNEXPLAINED,
+    CAMERA_POSES,
     ATTENTION,
     VIEW_GOAL,
     GOAL_STATUS,
@@ -119,7 +121,6 @@ REPLAYED_TOPICS = (*CAMERA_TOPICS, GROUND_TRUTH, EPISODE_START)
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock", Per.WHENEVER, "", transient_local=False)
 TRANSFORMS = Topic("/tf", "tf2_msgs/msg/TFMessage", Per.VIEW, "", transient_local=False)
 JOINT_STATES = Topic("joint_states", "sensor_msgs/msg/JointState", Per.VIEW, _CAMERA)
-CAMERA_POSES = Topic("objects/camera_poses", _POSES, Per.VIEW, _FUSION)
 DETECTIONS = Topic("objects/detections", "vision_msgs/msg/Detection3DArray", Per.VIEW, _FUSION)
 
 

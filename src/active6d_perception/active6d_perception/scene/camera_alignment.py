@@ -203,7 +203,8 @@ def _surface(view: MeasuredView) -> tuple[np.ndarray, np.ndarray]:
 def _align(points: np.ndarray, normals: np.ndarray, near: list[MeasuredView]) -> Alignment:
     """Align (n, 3) points and normals of a view, by its given pose, with views that have been aligned."""
     first = _step(points, normals, near, _FIRST_GATE)
-    if first is not None and _moved(points, first[0]) < _RIGHT:
+    # Points of the table alone pair anywhere, and say nothing of a shift along it.
+    if first is not None and first[1] > _LEAST_SHARE and _moved(points, first[0]) < _RIGHT:
         return _AS_GIVEN
     correction, share = _descend(points, normals, near, np.eye(4))
     if share < _FEW or _moved(points, correction) > _LARGE:

@@ -86,6 +86,11 @@ class WorkspaceGrid:
         centres = self.low + (np.indices(self.shape).reshape(3, -1).T + 0.5) * self.cell
         return centres.astype(np.float32).astype(float)
 
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """(n,) bool, whether (n, 3) points are inside of the grid; world, metres."""
+        high = self.low + np.array(self.shape) * self.cell
+        return np.all((points >= self.low) & (points <= high), axis=1)
+
     def observe(self, depth: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray) -> np.ndarray:
         """Find the cells in which a view shows surface.
 
@@ -242,10 +247,11 @@ class ObservedSurface:
         """(k, 3) centres of the unexplained cells: seen, and not near any of (n, 4, 4) poses; world, metres.
 
         (4, 4) ``T_world_anchor`` is from the frame in which views were added to the world, see
-        :attr:`.CameraAlignment.T_world_anchor`; the identity when None.
+        :attr:`.CameraAlignment.T_world_anchor`; the identity when None. What that moves out of the grid is left out.
         """
         anchor = np.eye(4) if T_world_anchor is None else T_world_anchor
         seen = np.logical_or.reduce([np.zeros(len(self.grid), bool), *self._seen.values()])
         points = self.grid.centres[seen]
         explained = self._explainer.explains(points, invert(anchor) @ T_world_object)
-        return transform_points(anchor, points[~explained.any(axis=0)])
+        left = transform_points(anchor, points[~explained.any(axis=0)])
+        return left[self.grid.holds(left)]

@@ -15,7 +15,10 @@ from active6d_perception.scene.fusion_parameters import FusionParameters
 
 @dataclass(frozen=True)
 class ObjectRow:
-    """One accumulated object at one step; attention and error are None if they are unknown."""
+    """One accumulated object at one step; attention and error are None if they are unknown.
+
+    An object is ``confirmed`` by the threshold that the fusion node had when recording.
+    """
 
     index: int
     verification: float
@@ -27,6 +30,7 @@ class ObjectRow:
     attended: bool
     e_add_mm: float | None
     detected: bool
+    confirmed: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +66,8 @@ class StepAnalysis:
 
     @property
     def confirmed(self) -> list[ObjectRow]:
-        """The objects that are more probably right than not."""
-        return [row for row in self.rows if row.probability >= FusionParameters.confirmed]
+        """The objects that are probable enough to count."""
+        return [row for row in self.rows if row.confirmed]
 
     @property
     def wrong(self) -> int | None:
@@ -103,6 +107,11 @@ class EpisodeAnalysis:
     sphere: ViewSphere
     steps: list[StepAnalysis]
     node_times: list[NodeTime]
+
+    @property
+    def confirmed_from(self) -> float:
+        """The probability from which an object is confirmed."""
+        return _confirmed_from(self.record)
 
     @property
     def distance_m(self) -> float:
@@ -178,7 +187,7 @@ def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAna
                 number=number,
                 record=step,
                 objects=objects,
-                rows=_rows(step, objects, score),
+                rows=_rows(step, objects, score, _confirmed_from(record)),
                 truth=score,
                 azimuth=float(azimuth[number] % 360.0),
                 elevation=float(elevation[number]),
@@ -189,7 +198,14 @@ def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAna
     return EpisodeAnalysis(model, record, sphere, steps, _node_times(record))
 
 
-def _rows(step: RecordedStep, objects: SceneObjects, truth: SceneScore | None) -> list[ObjectRow]:
+def _confirmed_from(record: EpisodeRecord) -> float:
+    value = record.settings.get("hypothesis_fusion", {}).get("confirmed")
+    return value if isinstance(value, float) else FusionParameters.confirmed
+
+
+def _rows(
+    step: RecordedStep, objects: SceneObjects, truth: SceneScore | None, confirmed_from: float
+) -> list[ObjectRow]:
     attention = step.attention if step.attention is not None and len(step.attention) == len(objects) else None
     errors, detected = {}, {}
     if truth is not None:
@@ -207,6 +223,7 @@ def _rows(step: RecordedStep, objects: SceneObjects, truth: SceneScore | None) -
             attended=step.attended == i,
             e_add_mm=errors.get(i),
             detected=detected.get(i, False),
+            confirmed=bool(objects.probability[i] >= confirmed_from),
         )
         for i in range(len(objects))
     ]

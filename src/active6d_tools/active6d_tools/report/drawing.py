@@ -89,7 +89,7 @@ class StepOutlines:
 def outline_step(drawer: SilhouetteDrawer, step: StepAnalysis, truth: np.ndarray | None) -> StepOutlines:
     """Outlines for one view; ``truth`` are the (n, 4, 4) true poses in the world where they are known."""
     view, hypotheses = step.record.view, step.record.hypotheses
-    T_camera_world = invert(view.T_world_camera)
+    T_camera_world = invert(step.record.T_world_camera)
     in_view = hypotheses.T_camera_object if hypotheses is not None else np.zeros((0, 4, 4))
     missed = np.zeros((0, 4, 4)) if truth is None or step.truth is None else truth[~step.truth.detected]
     groups = (T_camera_world @ step.objects.T_world_object, in_view, T_camera_world @ missed)

@@ -71,7 +71,7 @@ def _colors(analysis: EpisodeAnalysis, step: StepAnalysis) -> list[str]:
 def _mark_attended(axes: Axes, drawer: SilhouetteDrawer, step: StepAnalysis, moves: list[StepAnalysis]) -> None:
     """The numbers of moves, each at the object that the policy attended to for that move."""
     view = step.record.view
-    T_camera_world = invert(view.T_world_camera)
+    T_camera_world = invert(step.record.T_world_camera)
     places: list[tuple[np.ndarray, list[str]]] = []
     for move in moves:
         if move.attended is None:
