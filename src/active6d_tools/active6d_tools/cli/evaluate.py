@@ -25,7 +25,11 @@ from active6d_tools.cli.terminal import messages, print_table, progress_bar, wor
 #: A second table compares this policy with the others.
 _DEFAULT = "view-attention"
 Policies = Annotated[
-    str, typer.Option(help="Names separated by commas, or all: {policies}; and the bounds oracle and all-views.")
+    str,
+    typer.Option(
+        help="Names separated by commas: {policies}; and the bounds oracle and all-views. The word all stands for "
+        "these without attention-paper and sb3."
+    ),
 ]
 
 
@@ -157,10 +161,11 @@ def _print_policies(summary: dict[str, Any]) -> None:
             ends = row[f"{key}_ci95_scenes"]
             cells += [f"{row[key]:.{digits}f}", _range(ends, f".{digits}f", "-")]
         cells += [f"{row[key]:.3f}" if row.get(key) is not None else "-" for key in ("confirmed_rate", "wrong")]
-        rows.append([*cells, "-" if row["gap_closed"] is None else f"{row['gap_closed']:.0%}"])
+        rows.append([*cells, *([f"{row['gap_closed']:.0%}"] if row["gap_closed"] is not None else [])])
     title = f"{summary['object']}, T = {summary['steps']}, {summary['episodes']} episodes (95 % intervals over scenes)"
+    columns = "policy", "metres", "ADD, mm", "", "detected", "", "confirmed", "wrong"
     print_table(
-        ("policy", "distance, m", "ADD, mm", "", "detected", "", "confirmed", "wrong", "gap closed"), rows, title=title
+        (*columns, "gap closed") if any(len(row) > len(columns) for row in rows) else columns, rows, title=title
     )
 
 
@@ -174,7 +179,7 @@ def _print_differences(summary: dict[str, Any]) -> None:
             cells += [f"[{style}]{measured[key]['mean']:+.{digits}f}[/]", ends]
         rows.append(cells)
     title = f"{_DEFAULT} minus the others, from the same starts"
-    print_table(("against", "distance, m", "ADD, mm", "", "detected", ""), rows, title=title)
+    print_table(("against", "metres", "ADD, mm", "", "detected", ""), rows, title=title)
 
 
 def _range(ends: list[float] | None, form: str, between: str) -> str:

@@ -7,6 +7,7 @@ from rich.console import Console, JustifyMethod
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 #: Results only.
 console = Console()
@@ -40,15 +41,20 @@ def print_table(
 ) -> None:
     """Print a table without lines; without names of columns it has no header.
 
-    Cells of the first ``left`` columns are plain text to the left, the first of them in full. The other cells may have
-    rich's markup and are to the right.
+    Cells of the first ``left`` columns are plain text to the left. The other cells may have rich's markup and are to
+    the right. These and the first column are never cut: where the terminal is too narrow, lines are longer than it.
     """
     rows = [(*map(escape, row[:left]), *row[left:]) for row in rows]
-    table = Table(box=None, pad_edge=False, title=title, title_justify="left", show_header=any(columns))
+    table = Table(
+        box=None, pad_edge=False, title=title, title_justify="left", show_header=any(columns), collapse_padding=True
+    )
     for number, column in enumerate(columns):
-        width = max((len(row[0]) for row in rows), default=None) if number == 0 else None
         justify: JustifyMethod = "left" if number < left else "right"
-        table.add_column(column, justify=justify, header_style="dim", no_wrap=number == 0, min_width=width)
+        whole = number == 0 or number >= left
+        words = [*column.split(), *(row[number] for row in rows if number < len(row))]
+        width = max((Text.from_markup(word).cell_len for word in words), default=None) if whole else None
+        table.add_column(column, justify=justify, header_style="dim", min_width=width)
     for row in rows:
         table.add_row(*row)
-    console.print(table)
+    least = sum((column.min_width or 0) + 1 for column in table.columns)
+    console.print(table, width=max(console.width, least), crop=False)
