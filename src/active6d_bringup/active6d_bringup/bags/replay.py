@@ -19,10 +19,10 @@ from active6d_bringup.bags.writer import TYPESTORE, stamp_of
 from active6d_bringup.graph.composition import (
     GraphDescription,
     OnEvent,
-    default_params_file,
     running,
 )
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
+from active6d_bringup.graph.params_file import default_params_file
 from active6d_core.ros.conversions import own_statuses, read_table, status_values
 from active6d_core.ros.node import qos_of
 from active6d_core.ros.topics import DIAGNOSTICS, PERCEPTION_TOPICS, Topic

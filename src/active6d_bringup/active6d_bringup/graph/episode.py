@@ -25,10 +25,10 @@ from active6d_bringup.graph.composition import (
     Graph,
     GraphDescription,
     OnEvent,
-    default_params_file,
     running,
 )
 from active6d_bringup.graph.composition import EpisodeInterrupted as EpisodeInterrupted
+from active6d_bringup.graph.params_file import default_params_file
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.nearest_name import did_you_mean
 from active6d_core.ros import topics

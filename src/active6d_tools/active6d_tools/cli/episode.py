@@ -61,8 +61,8 @@ def episode(
     """
     _check_reports(bag, report, figure)
     with messages.status("starting"):
-        from active6d_bringup.graph.composition import check_parameters
         from active6d_bringup.graph.episode import EpisodeSettings
+        from active6d_bringup.graph.params_file import check_parameters
 
         settings = EpisodeSettings(
             object=object_name,
