@@ -90,6 +90,30 @@ def test_episode_report_and_replay(tmp_path, run):
     assert "exists already" in refused.stderr
 
 
+def test_what_the_file_says_is_run_scored_and_printed(tmp_path, run):
+    file = tmp_path / "params.yaml"
+    file.write_text(
+        "camera_simulator: {ros__parameters: {object: bunny, seed: 3}}\n"
+        "pose_estimator: {ros__parameters: {estimator: stub}}\n"
+        "attention_policy: {ros__parameters: {object: bunny, policy: random, steps: 4}}\n"
+    )
+    result = run("episode", "--params-file", file, "--steps", 1, "--bag", tmp_path / "bag", "--json", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    assert "bunny/seed/3, random: 1 moves" in result.stdout
+    record, summary = read_episode(tmp_path / "bag"), json.loads((tmp_path / "out").read_text())
+    assert (record.object, record.seed, record.policy, len(record.steps)) == ("bunny", 3, "random", 2)
+    assert [summary[key] for key in ("object", "seed", "policy", "moves")] == ["bunny", 3, "random", 1]
+    score = evaluate_scene(load_object("bunny"), record.steps[-1].objects.T_world_object, record.ground_truth)
+    assert summary["e_add_mm"] == pytest.approx(score.mean_e_add_mm)
+    assert run("episode", "--params-file", file, "--steps", 1, "--policy", "max-distance").stdout.count("max-distance")
+
+
+def test_help_says_where_a_default_comes_from(run):
+    words = " ".join(run("episode", "--help").stdout.replace("│", " ").split())
+    for last in ("mug", "0", "auto", "5", "none", "flying"):
+        assert f"by default that of the params file, else {last}." in words
+
+
 @pytest.mark.parametrize(
     ("error", "options", "code", "line"),
     [
