@@ -8,7 +8,7 @@ from ros_harness import fresh_domain
 
 from active6d_agent.nodes.attention_policy import AttentionPolicyNode
 from active6d_bringup.graph.episode import EpisodeSettings, ResolvedSettings, describe, resolve
-from active6d_bringup.graph.params_file import parameters_of, read_params_file
+from active6d_bringup.graph.params_file import default_params_file, parameters_of, read_params_file, unused_sections
 
 NODE = "camera_simulator"
 
@@ -115,3 +115,16 @@ def test_different_objects_are_refused_by_the_names_of_the_nodes(write):
 def test_a_value_of_another_type_is_refused(write, node, wrong):
     with pytest.raises(ValueError, match=rf"parameter '{next(iter(wrong))}' must be a"):
         resolve(EpisodeSettings(params_file=write({node: wrong})))
+
+
+def test_sections_for_no_node_are_named(write):
+    nodes = describe(resolve(EpisodeSettings())).nodes
+    foreign = {"/**": {}, "bag_player": {}, "camera_driver": {}, "moveit": {}, f"/cell/{NODE}": {}}
+    sections = read_params_file(write(foreign))
+    assert unused_sections(sections, nodes) == [
+        "active6d has no node 'camera_driver', did you mean 'camera_adapter'?; its parameters are not used",
+        "active6d has no node 'moveit'; its parameters are not used",
+        f"the parameters of '/cell/{NODE}' are not used: the node is /{NODE}",
+    ]
+    assert unused_sections(sections[-1:], nodes, "cell") == []
+    assert unused_sections(read_params_file(default_params_file()), nodes, "cell") == []

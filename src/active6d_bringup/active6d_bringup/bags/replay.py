@@ -140,6 +140,7 @@ def replay(
     episodes = read_episodes(index)
     stamps = [step.stamp for episode in episodes for step in episode.steps]
     description = describe(settings, episodes[0].object, index.settings, index.frames)
+    description.name_unused(on_event)
     with interruptible() as interrupted, running(make_graph(settings, description, on_event, interrupted)) as graph:
         listener = _Listener(graph.context, on_event)
         graph.add(listener)

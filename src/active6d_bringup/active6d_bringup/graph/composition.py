@@ -14,7 +14,7 @@ from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
-from active6d_bringup.graph.params_file import default_params_file, read_params_file
+from active6d_bringup.graph.params_file import default_params_file, read_params_file, unused_sections
 from active6d_core.interrupts import INTERRUPTS
 from active6d_core.ros.graph_nodes import NODES
 from active6d_core.ros.network import DomainClaim, domain_of, explain_start
@@ -74,6 +74,12 @@ class GraphDescription:
     @cached_property
     def _claim(self) -> DomainClaim:
         return DomainClaim(self.domain if self.domain is not None else domain_of(), self.namespace)
+
+    def name_unused(self, on_event: OnEvent) -> None:
+        """Report sections of the params file that are for no node: ROS would ignore a mistyped name."""
+        if self.params_file is not None:
+            for sentence in unused_sections(read_params_file(self.params_file), self.nodes, self.namespace):
+                on_event(f"params file {self.params_file}: {sentence}")
 
     def name_others(self, node: Node, on_event: OnEvent) -> bool:
         """Report other nodes in a domain that the user named, if ``node`` of this graph has discovered any."""

@@ -215,6 +215,7 @@ def run_episode(
 
     resolved = resolve(settings)
     description = describe(resolved)
+    description.name_unused(note)
     with interruptible() as interrupted, running(make_graph(settings, description, note, interrupted)) as graph:
         monitor = EpisodeMonitor(graph.context, settings.namespace, on_step)
         graph.add(monitor)

@@ -1,7 +1,7 @@
 """ROS parameter files: the shipped one, what a file says of a node, and what in it is wrong."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,13 @@ from typing import Any
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
 from active6d_core.nearest_name import did_you_mean
+from active6d_core.ros.graph_nodes import NODES
 from active6d_core.structured_text import read_yaml
 
 #: The names of nodes that a file gives, with wildcards as in ROS, each with its parameters; in the file's order.
 Sections = list[tuple[str, dict[str, Any]]]
+#: Names this much alike are the same but for a letter or two.
+_TYPO = 0.9
 
 
 def default_params_file() -> Path | None:
@@ -42,6 +45,7 @@ def read_params_file(path: Path) -> Sections:
         raise ValueError(f"params file {path}: {expected} ({type(error).__name__}: {error})") from error
     for name, parameters in sections:
         try:
+            _refuse_typo(_last(name))
             check_parameters({_last(name): parameters})
         except ValueError as error:
             raise ValueError(f"params file {path}: {error}") from error
@@ -49,9 +53,24 @@ def read_params_file(path: Path) -> Sections:
 
 
 def parameters_of(sections: Sections, node: str, namespace: str = "") -> dict[str, Any]:
-    """What ROS gives a node of a file: of all sections whose name matches the node's, the last one has the word."""
-    name = "/".join(part for part in ("", *namespace.split("/"), node) if part)
+    """What ROS gives a node of a file: of all sections whose name matches the node's, the last one counts."""
+    name = _full_name(node, namespace)
     return {key: value for pattern, own in sections if _matches(pattern, name) for key, value in own.items()}
+
+
+def unused_sections(sections: Sections, nodes: Iterable[str], namespace: str = "") -> list[str]:
+    """A sentence on each section that is for none of these nodes, nor for another node of active6d."""
+    names = {node: _full_name(node, namespace) for node in nodes}
+    sentences = []
+    for pattern, _ in sections:
+        last = _last(pattern)
+        if "*" in last or (last in NODES and last not in names):
+            continue
+        if last not in NODES:
+            sentences.append(f"active6d has no node '{last}'{did_you_mean(last, NODES)}; its parameters are not used")
+        elif not _matches(pattern, names[last]):
+            sentences.append(f"the parameters of '{pattern}' are not used: the node is /{names[last]}")
+    return sentences
 
 
 def check_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
@@ -90,6 +109,17 @@ def _sections(path: Path) -> Sections:
 def _last(name: str) -> str:
     """The last part of a node's name: the name without namespaces."""
     return name.rpartition("/")[2]
+
+
+def _full_name(node: str, namespace: str) -> str:
+    """The node's name with its namespace, without the first slash."""
+    return "/".join(part for part in (*namespace.split("/"), node) if part)
+
+
+def _refuse_typo(node: str) -> None:
+    """Other programs' nodes may share the file, so only what is nearly the name of a node is refused."""
+    if node not in NODES and (hint := did_you_mean(node, NODES, _TYPO)):
+        raise ValueError(f"there is no node '{node}'{hint}")
 
 
 def _matches(pattern: str, name: str) -> bool:
