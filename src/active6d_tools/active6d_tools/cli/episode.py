@@ -24,12 +24,18 @@ if TYPE_CHECKING:
 _FILE = "by default that of the params file"
 _OBJECT = f"Name of the object, see `active6d object list`; {_FILE}, else mug."
 _SEED = f"Seed of the pile, the sensor noise and the policy; {_FILE}, else 0."
-_POLICY = f"Policy that chooses the views: auto, {{policies}}; {_FILE}, else auto."
+_POLICY = (
+    "Policy that chooses the views: {policies}, or auto for view-attention where it has weights for the object, "
+    f"else unidirectional; {_FILE}, else auto."
+)
 _STEPS = f"Budget of moves T; T moves give T + 1 views; {_FILE}, else 5."
 _METRES = f"Travel budget in metres along the hemisphere, 0: none; {_FILE}, else none."
 _SECONDS = f"Budget of seconds of motion, 0: none; {_FILE}, else none."
 _CAMERA = f"Simulated camera: flying, or arm for one at the wrist of a simulated arm; {_FILE}, else flying."
-_ESTIMATOR = f"Estimator of the poses in each view: auto, {{estimators}}; {_FILE}, else auto."
+_ESTIMATOR = (
+    "Estimator of the poses in each view: {estimators}, or auto for dense where the object has weights, "
+    f"else geometric; {_FILE}, else auto."
+)
 _SCENE = f"Stored scene, such as mug/test/3, instead of a pile simulated with --seed; {_FILE}, else none."
 _SENSOR = f"Sensor model: auto (active_stereo, in wild scenes random), {{sensors}}; {_FILE}, else auto."
 
@@ -178,7 +184,10 @@ def _score(step: "EpisodeStep", object_name: str) -> "SceneScore | None":
 
 def _summary(result: "EpisodeResult") -> dict[str, Any]:
     """The numbers for JSON, with all poses, so that two episodes can be compared."""
+    from active6d_tools.report.analysis import count_confirmed
+
     last = _score(result.steps[-1], result.settings.object)
+    confirmed, wrong = count_confirmed(result.objects, last)
     return {
         "object": result.settings.object,
         "scene": result.info.get("scene"),
@@ -193,6 +202,8 @@ def _summary(result: "EpisodeResult") -> dict[str, Any]:
         "objects_true": len(last.detected) if last else None,
         "detection_rate": last.detection_rate if last else None,
         "e_add_mm": last.mean_e_add_mm if last else None,
+        "confirmed": confirmed,
+        "wrong": wrong,
         "events": result.events,
         "steps": [
             {
@@ -219,6 +230,8 @@ def _print_summary(result: "EpisodeResult", summary: dict[str, Any]) -> None:
     else:
         found = f"{summary['detection_rate'] * summary['objects_true']:.0f} of {summary['objects_true']}"
         rows.append(("found", f"{found} ({summary['detection_rate']:.0%}), mean ADD {summary['e_add_mm']:.1f} mm"))
+    wrong = "" if summary["wrong"] is None else f", of which {summary['wrong']} wrong"
+    rows.append(("confirmed", f"{summary['confirmed']}{wrong}"))
     rows += [("refused", reason) for reason in result.refused]
     rows += [("event", event) for event in result.events if not event.startswith("starting ")]
     if result.settings.bag is not None:

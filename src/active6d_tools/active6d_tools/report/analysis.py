@@ -68,7 +68,7 @@ class StepAnalysis:
     @property
     def wrong(self) -> int | None:
         """How many confirmed objects are no true object's detection, None without ground truth."""
-        return None if self.truth is None else sum(not row.detected for row in self.confirmed)
+        return count_confirmed(self.objects, self.truth)[1]
 
     @property
     def attended(self) -> ObjectRow | None:
@@ -187,6 +187,18 @@ def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAna
             )
         )
     return EpisodeAnalysis(model, record, sphere, steps, _node_times(record))
+
+
+def count_confirmed(objects: SceneObjects, truth: SceneScore | None) -> tuple[int, int | None]:
+    """How many objects are more probably right than not, and how many of these are no true object's detection.
+
+    The second number is None without ground truth.
+    """
+    confirmed = objects.probability >= FusionParameters.confirmed
+    if truth is None:
+        return int(confirmed.sum()), None
+    confirmed_and_right = confirmed[truth.matched[truth.detected]]
+    return int(confirmed.sum()), int(confirmed.sum() - confirmed_and_right.sum())
 
 
 def _rows(step: RecordedStep, objects: SceneObjects, truth: SceneScore | None) -> list[ObjectRow]:
