@@ -204,8 +204,9 @@ def test_listed_views_then_no_reachable_view_is_left(episode):
 
 def test_metres_are_a_budget(episode):
     played = episode(policy="max-distance", steps=20, metres=2.5)
-    assert SPHERE.path_length(SPHERE.positions[played.run(0)]) <= 2.5
-    assert played.ends[0].status[0].message == "no reachable view is left"
+    left = 2.5 - SPHERE.path_length(SPHERE.positions[played.run(0)])
+    assert left >= 0
+    assert played.ends[0].status[0].message == f"no view within the {left:.2f} m left of the budget of 2.50 m"
 
 
 def answer(played, state, reason=""):

@@ -121,7 +121,24 @@ def test_a_camera_that_reaches_nothing_ends_the_episode(policy):
 
 def test_budgets_end_it(policy):
     assert decide(make_state(steps=0), policy) == (None, "budget of 0 moves spent")
-    assert decide(make_state(metres=1e-3), policy)[1] == "no reachable view is left"
+    assert decide(make_state(metres=1e-3), policy)[1] == "no view within the 0.00 m left of the budget of 0.00 m"
+
+
+def test_a_budget_whose_rest_is_too_short_is_named(policy):
+    # Neighbours on the ring of 15 degrees: 20 views around a circle of 0.8 m times cos(15), a chord of 0.2418 m.
+    arc = 0.8 * 2 * np.arcsin(np.sin(np.pi / 20) * np.cos(np.radians(15.0)))
+    state = make_state(metres=arc + 0.04)
+    state.add_view(1 + 2 * 10**9, SPHERE.positions[1])
+    total = f"{arc + 0.04:.2f} m"
+    assert decide(state, policy)[1] == f"no view within the 0.04 m left of the budget of {total}"
+    # Two seconds for that way, half a second is left; the nearest views are 15 degrees, 0.21 m, away.
+    state = make_state(seconds=2.5)
+    state.add_view(1 + 2 * 10**9, SPHERE.positions[1])
+    assert decide(state, policy)[1] == "no view within the 0.5 s left of the budget of 2.5 s"
+    # Nothing is left whatever the budget.
+    state = make_state(views=[0, 1], metres=10.0)
+    state.add_view(2, SPHERE.positions[1])
+    assert decide(state, policy)[1] == "no reachable view is left"
 
 
 def test_seconds_are_counted_by_stamps_and_limit_the_way_at_the_pace_so_far(policy):

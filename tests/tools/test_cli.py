@@ -171,6 +171,8 @@ def test_a_wrong_parameter_is_one_line_with_the_nearest_name(override, words):
     ("text", "words"),
     [
         ("hypothesis_fusion:\n  ros__parameters: {epsilom: 0.1}\n", "did you mean 'epsilon'?"),
+        ("hypothesis_fuson:\n  ros__parameters: {epsilon: 0.1}\n", "did you mean 'hypothesis_fusion'?"),
+        ("/**/camera_simulatr:\n  ros__parameters: {seed: 1}\n", "no node 'camera_simulatr', did you mean"),
         ("- 1\n", "it must hold NODE"),
         ("a: &x {}\nb: *x\n", "alias"),
     ],

@@ -64,7 +64,7 @@ def test_episode_report_and_replay(tmp_path, run):
     assert summary["e_add_mm"] == pytest.approx(score.mean_e_add_mm)
     chords = np.linalg.norm(np.diff(record.positions, axis=0), axis=1)
     assert summary["distance_m"] == pytest.approx((2 * 0.8 * np.arcsin(chords / 1.6)).sum(), abs=1e-9)
-    assert f"found    {score.detected.sum()} of {len(score.detected)}" in result.stdout
+    assert f"found      {score.detected.sum()} of {len(score.detected)}" in result.stdout
     assert "budget of 2 moves spent" in result.stdout
     assert [line for line in result.stderr.splitlines() if line.startswith("view  2 at")]
     assert page.read_text().startswith("<!doctype html>")
@@ -79,6 +79,10 @@ def test_episode_report_and_replay(tmp_path, run):
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["distance_m"] == pytest.approx(summary["distance_m"])
     assert f"found {score.detected.sum()} of {len(score.detected)} objects" in again.stdout
+    last = report["steps"][-1]
+    assert (summary["confirmed"], summary["wrong"]) == (last["confirmed"], last["wrong"])
+    probable = record.steps[-1].objects.probability >= 0.5
+    assert f"confirmed  {probable.sum()}, of which {last['wrong']} wrong" in result.stdout
     assert run("report", bag, "--episode", 1).exit_code == 2
 
     replayed = run("replay", bag, "--as-fast", "--compare", "--json", tmp_path / "replay.json")
@@ -88,6 +92,30 @@ def test_episode_report_and_replay(tmp_path, run):
     refused = run("episode", *stub, "--bag", bag)
     assert refused.exit_code == 2
     assert "exists already" in refused.stderr
+
+
+def test_what_the_file_says_is_run_scored_and_printed(tmp_path, run):
+    file = tmp_path / "params.yaml"
+    file.write_text(
+        "camera_simulator: {ros__parameters: {object: bunny, seed: 3}}\n"
+        "pose_estimator: {ros__parameters: {estimator: stub}}\n"
+        "attention_policy: {ros__parameters: {object: bunny, policy: random, steps: 4}}\n"
+    )
+    result = run("episode", "--params-file", file, "--steps", 1, "--bag", tmp_path / "bag", "--json", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    assert "bunny/seed/3, random: 1 moves" in result.stdout
+    record, summary = read_episode(tmp_path / "bag"), json.loads((tmp_path / "out").read_text())
+    assert (record.object, record.seed, record.policy, len(record.steps)) == ("bunny", 3, "random", 2)
+    assert [summary[key] for key in ("object", "seed", "policy", "moves")] == ["bunny", 3, "random", 1]
+    score = evaluate_scene(load_object("bunny"), record.steps[-1].objects.T_world_object, record.ground_truth)
+    assert summary["e_add_mm"] == pytest.approx(score.mean_e_add_mm)
+    assert run("episode", "--params-file", file, "--steps", 1, "--policy", "max-distance").stdout.count("max-distance")
+
+
+def test_help_says_where_a_default_comes_from(run):
+    words = " ".join(run("episode", "--help").stdout.replace("│", " ").split())
+    for last in ("mug", "0", "auto", "5", "none", "flying"):
+        assert f"by default that of the params file, else {last}." in words
 
 
 @pytest.mark.parametrize(

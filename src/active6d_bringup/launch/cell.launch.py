@@ -25,7 +25,8 @@ ARGUMENTS = {
     "bag": (None, "folder to create for the recording; the first thing to look at when something went wrong"),
     "policy": (
         "",
-        "which policy chooses the views, auto: the best that the object has weights for; empty: as in params_file",
+        "which policy chooses the views, auto: view-attention if it has weights for the object, else "
+        "unidirectional; empty: as in params_file",
     ),
     "estimator": (
         "",

@@ -51,7 +51,7 @@ class AttentionPolicyNode(GraphNode):
         self.declare(
             "policy",
             AUTOMATIC,
-            "name of the policy that chooses views; auto: the learned one if it has weights for the object",
+            "policy that chooses views; auto: view-attention if it has weights for the object, else unidirectional",
             choices=[AUTOMATIC, *list_policies()],
         )
         self.declare("policy_parameters", "{}", "parameters of the policy, a YAML mapping")

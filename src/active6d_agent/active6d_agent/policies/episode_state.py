@@ -1,6 +1,6 @@
 """The state of one episode of a policy: views taken, budget left, and the views that the camera did not go to."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -111,7 +111,7 @@ class EpisodeState:
         if decision.stop:
             if observation.candidates().any():
                 return decision, "the policy stopped: no view is worth the move"
-            return decision, f"no reachable view is left{self._describe_struck()}"
+            return decision, f"{self._describe_end(observation)}{self._describe_struck()}"
         self._goal, self._waited = decision.position, 0.0
         return decision, ""
 
@@ -163,6 +163,16 @@ class EpisodeState:
             return Decision.stop_here(observation)
         view = int(np.where(candidates, sphere.arc(sphere.positions, position), np.inf).argmin())
         return Decision.go_to(observation, view, decision.attention, decision.attended)
+
+    def _describe_end(self, observation: Observation) -> str:
+        """Why no view can be next: the budget's rest is too short, or there is none."""
+        limits, left = self._limits, observation.metres_left
+        if not replace(observation, metres_left=np.inf).candidates().any():
+            return "no reachable view is left"
+        if limits.metres > 0 and left == limits.metres - self.travelled:
+            return f"no view within the {max(left, 0.0):.2f} m left of the budget of {limits.metres:.2f} m"
+        seconds = limits.seconds - self.elapsed
+        return f"no view within the {seconds:.1f} s left of the budget of {limits.seconds:g} s"
 
     def _describe_struck(self) -> str:
         parts = []

@@ -19,10 +19,10 @@ from active6d_bringup.bags.writer import TYPESTORE, stamp_of
 from active6d_bringup.graph.composition import (
     GraphDescription,
     OnEvent,
-    default_params_file,
     running,
 )
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
+from active6d_bringup.graph.params_file import default_params_file
 from active6d_core.ros.conversions import own_statuses, read_table, status_values
 from active6d_core.ros.node import qos_of
 from active6d_core.ros.topics import DIAGNOSTICS, PERCEPTION_TOPICS, Topic
@@ -140,6 +140,7 @@ def replay(
     episodes = read_episodes(index)
     stamps = [step.stamp for episode in episodes for step in episode.steps]
     description = describe(settings, episodes[0].object, index.settings, index.frames)
+    description.name_unused(on_event)
     with interruptible() as interrupted, running(make_graph(settings, description, on_event, interrupted)) as graph:
         listener = _Listener(graph.context, on_event)
         graph.add(listener)

@@ -1,26 +1,24 @@
 """Which nodes make the graph, and how they run together in one process on one executor."""
 
 import gc
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from threading import Event
 from typing import Any, Protocol
 
-from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
+from active6d_bringup.graph.params_file import default_params_file, read_params_file, unused_sections
 from active6d_core.interrupts import INTERRUPTS
-from active6d_core.nearest_name import did_you_mean
 from active6d_core.ros.graph_nodes import NODES
 from active6d_core.ros.network import DomainClaim, domain_of, explain_start
 from active6d_core.ros.publishers import others_in_domain
-from active6d_core.structured_text import read_yaml
 
 OnEvent = Callable[[str], None]
 #: What is missing as long as a recorder has not said what it lacks.
@@ -54,7 +52,7 @@ class GraphDescription:
         if unknown:
             raise ValueError(f"unknown node '{min(unknown)}'; known: {', '.join(NODES)}")
         if self.params_file is not None and self.params_file != default_params_file():
-            _check_params_file(self.params_file)
+            read_params_file(self.params_file)
 
     def in_order(self) -> list[str]:
         """The nodes' names in the order of starting."""
@@ -76,6 +74,12 @@ class GraphDescription:
     @cached_property
     def _claim(self) -> DomainClaim:
         return DomainClaim(self.domain if self.domain is not None else domain_of(), self.namespace)
+
+    def name_unused(self, on_event: OnEvent) -> None:
+        """Report sections of the params file that are for no node: ROS would ignore a mistyped name."""
+        if self.params_file is not None:
+            for sentence in unused_sections(read_params_file(self.params_file), self.nodes, self.namespace):
+                on_event(f"params file {self.params_file}: {sentence}")
 
     def name_others(self, node: Node, on_event: OnEvent) -> bool:
         """Report other nodes in a domain that the user named, if ``node`` of this graph has discovered any."""
@@ -214,63 +218,3 @@ def running(graph: Graph) -> Iterator[Graph]:
         # Nodes and their callbacks refer to each other. Python would collect them after hundreds of graphs, because it
         # counts objects, of which an image is one.
         gc.collect()
-
-
-def default_params_file() -> Path | None:
-    """The parameters that ship with this package: in the source tree, else in its installed share folder."""
-    source = Path(__file__).parents[2] / "config" / "active6d.yaml"
-    if source.is_file():
-        return source
-    try:
-        installed = Path(get_package_share_directory("active6d_bringup")) / "config" / "active6d.yaml"
-    except PackageNotFoundError:
-        return None
-    return installed if installed.is_file() else None
-
-
-def check_parameters(parameters: Mapping[str, Mapping[str, Any]]) -> None:
-    """Check that nodes have the parameters that were set; ROS would ignore a mistyped name.
-
-    Args:
-        parameters: node name to parameters by name.
-
-    Raises:
-        ValueError: a node has no such parameter, or a value is of another type; the message has the nearest name.
-    """
-    known = _default_parameters()
-    for node in parameters.keys() & known.keys():
-        for name, value in parameters[node].items():
-            if name == "use_sim_time" or name.startswith("qos_overrides"):
-                continue
-            if name not in known[node]:
-                raise ValueError(f"{node} has no parameter '{name}'{did_you_mean(name, known[node])}")
-            expected = known[node][name]
-            if type(value) is not type(expected):
-                kind = type(expected).__name__
-                raise ValueError(f"{node}: parameter '{name}' must be a {kind} such as {expected!r}, got {value!r}")
-
-
-@cache
-def _default_parameters() -> dict[str, dict[str, Any]]:
-    """Node name to the default values of its parameters, from the shipped file; empty without it."""
-    path = default_params_file()
-    return {} if path is None else _sections(path)
-
-
-def _sections(path: Path) -> dict[str, dict[str, Any]]:
-    """The parameters in a ROS parameter file by the last part of the node's name."""
-    return {str(node).rpartition("/")[2]: dict(section["ros__parameters"]) for node, section in read_yaml(path).items()}
-
-
-def _check_params_file(path: Path) -> None:
-    if not path.is_file():
-        raise ValueError(f"params file {path} does not exist")
-    try:
-        sections = _sections(path)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        expected = "it must hold NODE: {ros__parameters: {NAME: VALUE}}"
-        raise ValueError(f"params file {path}: {expected} ({type(error).__name__}: {error})") from error
-    try:
-        check_parameters(sections)
-    except ValueError as error:
-        raise ValueError(f"params file {path}: {error}") from error

@@ -25,10 +25,15 @@ from active6d_bringup.graph.composition import (
     Graph,
     GraphDescription,
     OnEvent,
-    default_params_file,
     running,
 )
 from active6d_bringup.graph.composition import EpisodeInterrupted as EpisodeInterrupted
+from active6d_bringup.graph.params_file import (
+    check_parameters,
+    default_params_file,
+    parameters_of,
+    read_params_file,
+)
 from active6d_core.hypotheses import SceneObjects
 from active6d_core.nearest_name import did_you_mean
 from active6d_core.ros import topics
@@ -50,7 +55,15 @@ from active6d_core.ros.episode_messages import (
 )
 from active6d_core.ros.node import qos_of
 from active6d_core.view_sphere import ViewSphere
+from active6d_perception.scene.fusion_parameters import FusionParameters
 
+#: The nodes of every episode, each with the settings that are parameters of it.
+_PARAMETERS = {
+    "camera_simulator": ("object", "seed", "scene", "sensor", "carrier"),
+    "pose_estimator": ("object", "estimator"),
+    "hypothesis_fusion": ("object",),
+    "attention_policy": ("object", "seed", "policy", "steps", "metres", "seconds"),
+}
 #: How long a recorder may lag behind the end of an episode in which a node died.
 _SETTLE_SECONDS = 5.0
 
@@ -61,17 +74,17 @@ class EpisodeError(RuntimeError):
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """What to run.
+    """What to run. A setting that is None is as in the params file, else at the nodes' default.
 
     Attributes:
-        object: name of the object that fills the bin.
+        object: name of the object that fills the bin; the file must not give the nodes different ones.
         seed: of the heap, the sensor noise and the policy.
         scene: a stored scene such as ``mug/test/3`` in place of a heap dropped by ``seed``.
         policy: name of the policy.
         steps: budget of moves T.
-        metres: budget of metres along the hemisphere, None without one.
-        seconds: budget of seconds of motion, None without one.
-        estimator: name of the estimator, None for the params file's.
+        metres: budget of metres along the hemisphere, 0 for none.
+        seconds: budget of seconds of motion, 0 for none.
+        estimator: name of the estimator.
         sensor: name of the simulated camera's sensor model; auto for the default one, or a random one in a wild scene.
         carrier: what carries the simulated camera: ``flying`` for nothing, or ``arm`` for a simulated arm.
         bag: folder to create for the recording, None for no recording.
@@ -83,16 +96,16 @@ class EpisodeSettings:
         patience: seconds without progress after which the episode counts as stuck. It decides no result.
     """
 
-    object: str = "mug"
-    seed: int = 0
+    object: str | None = None
+    seed: int | None = None
     scene: str | None = None
-    policy: str = "auto"
-    steps: int = 5
+    policy: str | None = None
+    steps: int | None = None
     metres: float | None = None
     seconds: float | None = None
     estimator: str | None = None
-    sensor: str = "auto"
-    carrier: str = "flying"
+    sensor: str | None = None
+    carrier: str | None = None
     bag: Path | None = None
     processes: bool = False
     params_file: Path | None = None
@@ -100,6 +113,21 @@ class EpisodeSettings:
     namespace: str = ""
     domain: int | None = None
     patience: float = 120.0
+
+
+@dataclass(frozen=True)
+class ResolvedSettings(EpisodeSettings):
+    """Settings with what the nodes really get; by default the nodes' own.
+
+    Attributes:
+        object: of all nodes.
+        steps: of the policy.
+        confirmed: probability from which fusion counts an object.
+    """
+
+    object: str = "mug"
+    steps: int = 5
+    confirmed: float = FusionParameters.confirmed
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +162,7 @@ class EpisodeResult:
     """An episode that came to its end.
 
     Attributes:
-        settings: what was asked for.
+        settings: what was asked for, with the object and the steps that were used.
         info: what the camera and the policy said of the episode (object, scene, seed, policy, ...).
         steps: one per view.
         ground_truth: (n, 4, 4) ``T_world_object`` if the camera knows it.
@@ -145,7 +173,7 @@ class EpisodeResult:
         events: what happened to the nodes, such as a restart.
     """
 
-    settings: EpisodeSettings
+    settings: ResolvedSettings
     info: dict[str, str]
     steps: list[EpisodeStep]
     ground_truth: np.ndarray | None
@@ -193,44 +221,61 @@ def run_episode(
         events.append(text)
         on_event(text)
 
-    description = describe(settings)
+    resolved = resolve(settings)
+    description = describe(resolved)
+    description.name_unused(note)
     with interruptible() as interrupted, running(make_graph(settings, description, note, interrupted)) as graph:
         monitor = EpisodeMonitor(graph.context, settings.namespace, on_step)
         graph.add(monitor)
         graph.start()
         description.name_others(monitor, note)
         _spin_to_end(graph, monitor, settings.patience, interrupted, note)
-        return monitor.result(settings, events)
+        return monitor.result(resolved, events)
+
+
+def resolve(settings: EpisodeSettings) -> ResolvedSettings:
+    """Look up in params file and overrides what the settings leave open; overrides have the last word.
+
+    Raises:
+        ValueError: params file and overrides give two nodes different objects, or a value is wrong.
+    """
+    sections = read_params_file(settings.params_file) if settings.params_file else []
+    elsewhere = {
+        name: {**parameters_of(sections, name, settings.namespace), **settings.overrides.get(name, {})}
+        for name in _PARAMETERS
+    }
+    steps = settings.overrides.get("attention_policy", {}).get("steps", settings.steps)
+    if steps is None:
+        steps = elsewhere["attention_policy"].get("steps", ResolvedSettings.steps)
+    confirmed = elsewhere["hypothesis_fusion"].get("confirmed", ResolvedSettings.confirmed)
+    check_parameters({"attention_policy": {"steps": steps}, "hypothesis_fusion": {"confirmed": confirmed}})
+    name = settings.object or _common_object(elsewhere, settings.params_file)
+    return ResolvedSettings(**{**vars(settings), "object": name, "steps": steps, "confirmed": confirmed})
+
+
+def _common_object(parameters: dict[str, dict[str, Any]], params_file: Path | None) -> str:
+    """The one object of all nodes that are given one."""
+    objects = {name: own["object"] for name, own in parameters.items() if "object" in own}
+    check_parameters({name: {"object": value} for name, value in objects.items()})
+    first = next(iter(objects), "")
+    for name, value in objects.items():
+        if value != objects[first]:
+            where = f"params file {params_file}: " if params_file else ""
+            raise ValueError(
+                f"{where}{first} has the object '{objects[first]}', but {name} has '{value}'; an episode has one "
+                "object, so give both the same, or name it with --object"
+            )
+    return objects.get(first, ResolvedSettings.object)
 
 
 def describe(settings: EpisodeSettings) -> GraphDescription:
-    """The graph of an episode, each node with its parameters."""
-    camera: dict[str, Any] = {"object": settings.object, "seed": settings.seed}
-    if settings.scene is not None:
-        camera["scene"] = settings.scene
-    if settings.sensor != "auto":
-        camera["sensor"] = settings.sensor
-    if settings.carrier != "flying":
-        camera["carrier"] = settings.carrier
-    policy: dict[str, Any] = {
-        "object": settings.object,
-        "seed": settings.seed,
-        "policy": settings.policy,
-        "steps": settings.steps,
-    }
-    if settings.metres is not None:
-        policy["metres"] = float(settings.metres)
-    if settings.seconds is not None:
-        policy["seconds"] = float(settings.seconds)
-    estimator = {"object": settings.object}
-    if settings.estimator is not None:
-        estimator["estimator"] = settings.estimator
+    """The graph of an episode, each node with the parameters that the settings give it."""
     nodes: dict[str, dict[str, Any]] = {
-        "camera_simulator": camera,
-        "pose_estimator": estimator,
-        "hypothesis_fusion": {"object": settings.object},
-        "attention_policy": policy,
+        name: {parameter: value for parameter in parameters if (value := getattr(settings, parameter)) is not None}
+        for name, parameters in _PARAMETERS.items()
     }
+    policy = nodes["attention_policy"]
+    policy.update({budget: float(policy[budget]) for budget in ("metres", "seconds") if budget in policy})
     if settings.bag is not None:
         nodes["episode_recorder"] = {"bag": str(settings.bag)}
     unknown = settings.overrides.keys() - nodes.keys()
@@ -367,7 +412,7 @@ class EpisodeMonitor(Node):
             return [topics.HYPOTHESES.name]
         return [(topics.VIEW_GOAL if view in self._objects else topics.OBJECTS).name]
 
-    def result(self, settings: EpisodeSettings, events: list[str]) -> EpisodeResult:
+    def result(self, settings: ResolvedSettings, events: list[str]) -> EpisodeResult:
         """The result of the episode, which must have ended."""
         steps = [self._step(index, stamp) for index, stamp in enumerate(sorted(self._poses.keys() & self._objects))]
         return EpisodeResult(

@@ -29,7 +29,7 @@ class PoseEstimatorNode(GraphNode):
         self.declare(
             "estimator",
             AUTOMATIC,
-            "name of the estimator; auto: the learned one if the object has weights",
+            "name of the estimator; auto: dense if the object has weights, else geometric",
             choices=[AUTOMATIC, *list_estimators()],
         )
         self.declare(

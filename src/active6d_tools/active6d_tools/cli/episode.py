@@ -10,38 +10,47 @@ from active6d_tools.cli.options import (
     Imports,
     JsonFile,
     NodeParameters,
-    ObjectName,
     ParamsFile,
     Processes,
-    Seed,
-    SensorName,
     parse_overrides,
 )
 from active6d_tools.cli.output import write_json, write_reports
 from active6d_tools.cli.terminal import messages, print_table, progress_bar
 
 if TYPE_CHECKING:
-    from active6d_bringup.graph.episode import EpisodeResult, EpisodeSettings, EpisodeStep
+    from active6d_bringup.graph.episode import EpisodeResult, EpisodeStep, ResolvedSettings
     from active6d_core.metrics import SceneScore
 
-_CAMERA = "Simulated camera: flying, or arm for one at the wrist of a simulated arm."
-_ESTIMATOR = "Estimator of the poses in each view: auto, {estimators}; by default that of the params file."
+_FILE = "by default that of the params file"
+_OBJECT = f"Name of the object, see `active6d object list`; {_FILE}, else mug."
+_SEED = f"Seed of the pile, the sensor noise and the policy; {_FILE}, else 0."
+_POLICY = (
+    "Policy that chooses the views: {policies}, or auto for view-attention where it has weights for the object, "
+    f"else unidirectional; {_FILE}, else auto."
+)
+_STEPS = f"Budget of moves T; T moves give T + 1 views; {_FILE}, else 5."
+_METRES = f"Travel budget in metres along the hemisphere, 0: none; {_FILE}, else none."
+_SECONDS = f"Budget of seconds of motion, 0: none; {_FILE}, else none."
+_CAMERA = f"Simulated camera: flying, or arm for one at the wrist of a simulated arm; {_FILE}, else flying."
+_ESTIMATOR = (
+    "Estimator of the poses in each view: {estimators}, or auto for dense where the object has weights, "
+    f"else geometric; {_FILE}, else auto."
+)
+_SCENE = f"Stored scene, such as mug/test/3, instead of a pile simulated with --seed; {_FILE}, else none."
+_SENSOR = f"Sensor model: auto (active_stereo, in wild scenes random), {{sensors}}; {_FILE}, else auto."
 
 
 def episode(
-    object_name: ObjectName = "mug",
-    seed: Seed = 0,
-    policy: Annotated[str, typer.Option(help="Policy that chooses the views: auto, {policies}.")] = "auto",
-    steps: Annotated[int, typer.Option(min=0, help="Budget of moves T; T moves give T + 1 views.")] = 5,
-    metres: Annotated[float | None, typer.Option(min=0.0, help="Travel budget in metres along the hemisphere.")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="Budget of seconds of motion.")] = None,
-    camera: Annotated[str, typer.Option(help=_CAMERA)] = "flying",
+    object_name: Annotated[str | None, typer.Option("--object", help=_OBJECT)] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help=_SEED)] = None,
+    policy: Annotated[str | None, typer.Option(help=_POLICY)] = None,
+    steps: Annotated[int | None, typer.Option(min=0, help=_STEPS)] = None,
+    metres: Annotated[float | None, typer.Option(min=0.0, help=_METRES)] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help=_SECONDS)] = None,
+    camera: Annotated[str | None, typer.Option(help=_CAMERA)] = None,
     estimator: Annotated[str | None, typer.Option(help=_ESTIMATOR)] = None,
-    scene: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Stored scene, such as mug/test/3, instead of a pile simulated with --seed."),
-    ] = None,
-    sensor: SensorName = "auto",
+    scene: Annotated[str | None, typer.Option(metavar="NAME", help=_SCENE)] = None,
+    sensor: Annotated[str | None, typer.Option(help=_SENSOR)] = None,
     bag: Annotated[Path | None, typer.Option(metavar="DIR", help="Record to a bag in this new folder.")] = None,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write an HTML report of the bag; needs --bag.")
@@ -61,10 +70,10 @@ def episode(
     """
     _check_reports(bag, report, figure)
     with messages.status("starting"):
-        from active6d_bringup.graph.composition import check_parameters
-        from active6d_bringup.graph.episode import EpisodeSettings
+        from active6d_bringup.graph.episode import EpisodeSettings, resolve
+        from active6d_bringup.graph.params_file import check_parameters
 
-        settings = EpisodeSettings(
+        asked = EpisodeSettings(
             object=object_name,
             seed=seed,
             scene=scene,
@@ -80,8 +89,9 @@ def episode(
             params_file=params_file,
             overrides=parse_overrides(override or []),
         )
+        check_parameters(asked.overrides)
+        settings = resolve(asked)
         _check_names(settings)
-        check_parameters(settings.overrides)
     result = _run(settings)
     summary = _summary(result)
     _print_summary(result, summary)
@@ -104,7 +114,7 @@ def _write_reports(bag: Path | None, report: Path | None, figure: Path | None) -
     write_reports(analyse(read_episode(bag)), report, figure=figure)
 
 
-def _check_names(settings: "EpisodeSettings") -> None:
+def _check_names(settings: "ResolvedSettings") -> None:
     """Refuse wrong names before any node starts; a node in its own process could report them only in its log."""
     from active6d_agent.policies.registry import list_policies
     from active6d_core.nearest_name import did_you_mean
@@ -125,7 +135,7 @@ def _check_names(settings: "EpisodeSettings") -> None:
             raise ValueError(f"{option} '{value}' is not among {', '.join(known)}{did_you_mean(value, known)}")
 
 
-def _run(settings: "EpisodeSettings") -> "EpisodeResult":
+def _run(settings: "ResolvedSettings") -> "EpisodeResult":
     """Run with one line per view and a progress bar; a failed episode gives one line and exit code 1."""
     from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, run_episode
     from active6d_bringup.graph.processes import ProcessError
@@ -174,12 +184,15 @@ def _score(step: "EpisodeStep", object_name: str) -> "SceneScore | None":
 
 def _summary(result: "EpisodeResult") -> dict[str, Any]:
     """The numbers for JSON, with all poses, so that two episodes can be compared."""
+    from active6d_tools.report.analysis import count_confirmed
+
     last = _score(result.steps[-1], result.settings.object)
+    confirmed, wrong = count_confirmed(result.objects, last, result.settings.confirmed)
     return {
         "object": result.settings.object,
         "scene": result.info.get("scene"),
-        "seed": result.settings.seed,
-        "policy": result.info.get("policy", result.settings.policy),
+        "seed": int(result.info["seed"]) if "seed" in result.info else None,
+        "policy": result.info.get("policy"),
         "moves": len(result.steps) - 1,
         "end_reason": result.reason,
         "distance_m": result.distance,
@@ -189,6 +202,8 @@ def _summary(result: "EpisodeResult") -> dict[str, Any]:
         "objects_true": len(last.detected) if last else None,
         "detection_rate": last.detection_rate if last else None,
         "e_add_mm": last.mean_e_add_mm if last else None,
+        "confirmed": confirmed,
+        "wrong": wrong,
         "events": result.events,
         "steps": [
             {
@@ -215,6 +230,8 @@ def _print_summary(result: "EpisodeResult", summary: dict[str, Any]) -> None:
     else:
         found = f"{summary['detection_rate'] * summary['objects_true']:.0f} of {summary['objects_true']}"
         rows.append(("found", f"{found} ({summary['detection_rate']:.0%}), mean ADD {summary['e_add_mm']:.1f} mm"))
+    wrong = "" if summary["wrong"] is None else f", of which {summary['wrong']} wrong"
+    rows.append(("confirmed", f"{summary['confirmed']}{wrong}"))
     rows += [("refused", reason) for reason in result.refused]
     rows += [("event", event) for event in result.events if not event.startswith("starting ")]
     if result.settings.bag is not None:

@@ -54,7 +54,7 @@ def replay(
         raise ValueError("--rate and --as-fast exclude each other")
     from active6d_bringup.bags.camera_topics import CameraOptions
     from active6d_bringup.bags.replay import ReplaySettings
-    from active6d_bringup.graph.composition import check_parameters
+    from active6d_bringup.graph.params_file import check_parameters
 
     settings = ReplaySettings(
         bag=folder,

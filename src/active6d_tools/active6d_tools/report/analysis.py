@@ -203,6 +203,19 @@ def _confirmed_from(record: EpisodeRecord) -> float:
     return value if isinstance(value, float) else FusionParameters.confirmed
 
 
+def count_confirmed(objects: SceneObjects, truth: SceneScore | None, confirmed_from: float) -> tuple[int, int | None]:
+    """How many objects have at least the probability ``confirmed_from``, and how many of these are no true object's
+    detection.
+
+    The second number is None without ground truth.
+    """
+    confirmed = objects.probability >= confirmed_from
+    if truth is None:
+        return int(confirmed.sum()), None
+    confirmed_and_right = confirmed[truth.matched[truth.detected]]
+    return int(confirmed.sum()), int(confirmed.sum() - confirmed_and_right.sum())
+
+
 def _rows(
     step: RecordedStep, objects: SceneObjects, truth: SceneScore | None, confirmed_from: float
 ) -> list[ObjectRow]:
