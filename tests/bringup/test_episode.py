@@ -91,6 +91,22 @@ def test_replay_equals_the_recording(tmp_path):
     assert progress[-1] == (4, 4)
 
 
+def test_a_recorded_replay_holds_all_that_was_computed_and_names_its_object(tmp_path):
+    run_episode(settings(tmp_path / "bag"))
+    result = replay(ReplaySettings(tmp_path / "bag", record=tmp_path / "again", domain=fresh_domain()))
+    first, again = payloads_by_topic(tmp_path / "bag"), payloads_by_topic(tmp_path / "again")
+    for topic in ("hypotheses", "objects", "objects/markers", "camera/pose"):
+        assert again[topic] == first[topic]
+    assert "view_goal" not in again
+    record = read_episode(tmp_path / "again")
+    assert (record.object, record.end_reason, record.damage) == ("mug", "end of the bag", ())
+    for step, view in zip(result.steps, record.steps, strict=True):
+        assert (step.stamp, step.hypotheses) == (view.stamp, len(view.hypotheses))
+        np.testing.assert_allclose(step.objects.T_world_object, view.objects.T_world_object)
+    with pytest.raises(RecordingError, match="again exists already"):
+        replay(ReplaySettings(tmp_path / "bag", record=tmp_path / "again"))
+
+
 def test_replay_finds_what_is_different(tmp_path):
     run_episode(settings(tmp_path / "bag"))
     changed = {"pose_estimator": {"estimator_parameters": '{"offset": 0.015625}'}}

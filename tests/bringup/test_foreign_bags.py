@@ -258,6 +258,12 @@ def test_every_view_that_is_left_out_is_counted_with_its_reason(tmp_path):
     assert {reason.split(" within")[0] for reason in index.left_out} == {"no depth image", "no camera pose"}
 
 
+def test_a_recording_without_poses_is_refused_with_what_can_be_done(tmp_path):
+    kept = [entry for entry in driver_messages() if entry[1] != POSE]
+    with pytest.raises(BagError, match=r"no camera poses or /tf in it; .*PoseStamped or /tf; .*estimate --rgb FILE"):
+        read_bag(write(tmp_path / "bag", kept))
+
+
 def test_a_stream_gives_one_view_of_each_place_where_the_camera_stood(tmp_path):
     messages = []
     for number in range(60):  # 15 Hz: two seconds here, half a second on the way, the rest there

@@ -14,7 +14,8 @@ from active6d_core.ros.heartbeat import Awaited
 from active6d_core.ros.node import GraphNode
 from active6d_tools import graph_doctor
 from active6d_tools.cli import app
-from active6d_tools.graph_doctor import examine_graph
+from active6d_tools.graph_doctor import PARTS, examine_graph, verdict
+from active6d_tools.machine_doctor import Check
 
 FAST = {"heartbeat": 0.2}
 
@@ -79,6 +80,21 @@ def test_silence_and_who_waits_for_whom(spinning):
     assert (info.ok, info.detail) == (False, "nobody publishes it; subscribed by viewer")
     assert checks["/view_goal"].detail == "nobody publishes it; subscribed by camera"
     assert "/attention" not in checks
+
+
+def test_the_verdict_names_what_a_whole_graph_has_beside_the_one_node(spinning):
+    graph, thread = spinning
+    graph.add(Viewer(context=graph.context))
+    thread.start()
+    checks = list(examine_graph(graph.domain, seconds=2.0))
+    missing = ["a camera", "attention_policy", "hypothesis_fusion", "pose_estimator"]
+    assert sorted(check.name for check in checks if check.group == PARTS) == missing
+    assert verdict(checks).startswith("The graph is not whole: no fault in the 1 node seen; missing: a camera, ")
+
+
+def test_a_graph_of_which_nothing_is_missing_works():
+    nodes = [Check("Nodes", name, True, False, "idle") for name in ("/a", "/b")]
+    assert verdict(nodes) == "The graph works: no fault in the 2 nodes seen."
 
 
 def test_a_mismatch_is_needed_and_named(spinning):

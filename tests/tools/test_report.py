@@ -17,6 +17,7 @@ from active6d_bringup.bags.reader import EpisodeRecord, RecordedStep
 from active6d_core.camera import PinholeCamera
 from active6d_core.object_model import ObjectModel, Symmetry
 from active6d_core.se3 import invert, make_transform
+from active6d_tools.cli.report import print_summary
 from active6d_tools.report.analysis import analyse
 from active6d_tools.report.drawing import ScoreScale, depth_to_color, outline_step
 from active6d_tools.report.figure import render_png
@@ -289,3 +290,16 @@ def test_colors():
     assert 0.5 <= near < far <= 1.0
     assert picture[0, 1].sum() > picture[1, 0].sum() > picture[1, 1].sum() > 0
     assert depth_to_color(np.full((2, 2), np.nan, np.float32))[1] == (0.0, 0.0)
+
+
+def test_a_bag_of_images_only_says_that_nothing_was_estimated(capsys):
+    record = make_record()
+    images = replace(record, folder=Path("bags/other"), steps=[RecordedStep(step.view) for step in record.steps])
+    analysis = analyse(images, "mug")
+    command = "active6d replay bags/other --object mug --as-fast --bag other_replayed"
+    assert command in render_html(analysis)
+    print_summary(analysis)
+    printed = capsys.readouterr().out
+    assert command in printed
+    assert "no hypotheses and no objects in the recording" in printed
+    assert not analyse(record, "mug").without_results

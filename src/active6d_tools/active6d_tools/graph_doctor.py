@@ -13,12 +13,17 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
 from active6d_core.ros.conversions import own_statuses, status_values
+from active6d_core.ros.graph_nodes import NODES
 from active6d_core.ros.network import domain_of, explain_start
-from active6d_core.ros.topics import CONTRACT
+from active6d_core.ros.topics import CAMERA_TOPICS, CONTRACT, Per
 from active6d_tools.machine_doctor import Check
 
 _NAME = "active6d_doctor"
+#: Who publishes the topics that an episode or a replay cannot do without, besides the camera.
+_PUBLISHERS = {topic.publisher for topic in CONTRACT if topic.per in (Per.VIEW, Per.MOVE)} - {"camera"}
 _DIAGNOSTICS = "/diagnostics"
+#: Group of what a whole graph has and this one lacks.
+PARTS = "Missing"
 #: From what the least demanding publisher offers to the most.
 _RELIABILITIES = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 _DURABILITIES = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
@@ -51,6 +56,7 @@ def examine_graph(domain: int | None = None, namespace: str = "", seconds: float
             executor.spin_once(timeout_sec=0.1)
         where = f"in domain {domain}, namespace /{namespace.strip('/')}"
         yield from _check_nodes(listener, where)
+        yield from _check_parts(listener)
         yield from _check_topics(listener, seconds)
     finally:
         executor.shutdown()
@@ -116,6 +122,27 @@ def _check_nodes(listener: _Listener, where: str) -> Iterator[Check]:
             detail += f" (published by {', '.join(sorted(sources))})"
         warned = status.level != DiagnosticStatus.OK
         yield Check("Nodes", name, not warned, warned, detail, "see the topics below" if warned else "")
+
+
+def _check_parts(listener: _Listener) -> Iterator[Check]:
+    """What a whole graph has and this one lacks; another node that publishes a node's topics stands in for it."""
+    seen = {name.rpartition("/")[2] for name in listener.heartbeats}
+    cameras = all(listener.publishers(listener.topics[topic.name]) for topic in CAMERA_TOPICS)
+    if not cameras:
+        fix = "start camera_adapter, camera_simulator, dataset_camera or bag_player"
+        yield Check(PARTS, "a camera", False, False, "camera/* topics without a publisher", fix)
+    for name in (node for node in NODES if node in _PUBLISHERS - seen):
+        outputs = [topic.name for topic in CONTRACT if topic.publisher == name and topic.per is not Per.EPISODE]
+        if not all(listener.publishers(listener.topics[topic]) for topic in outputs):
+            yield Check(PARTS, name, False, False, "not seen", "needed for episodes; start it, or launch the graph")
+
+
+def verdict(checks: list[Check]) -> str:
+    """What follows from the checks of a graph without a fault: how many nodes were seen, and what a whole one lacks."""
+    count = sum(check.group == "Nodes" for check in checks)
+    missing = ", ".join(check.name for check in checks if check.group == PARTS)
+    seen = f"no fault in the {count} node{'s' if count != 1 else ''} seen"
+    return f"The graph is not whole: {seen}; missing: {missing}." if missing else f"The graph works: {seen}."
 
 
 def _check_topics(listener: _Listener, seconds: float) -> Iterator[Check]:

@@ -23,6 +23,11 @@ _PNG, _PNG_DEPTH = b"\x89PNG", bytes([16, 0])  # 16 bits of grey
 _NAMES = {"color": CAMERA_COLOR.name, "depth": CAMERA_DEPTH.name, "info": CAMERA_INFO.name, "pose": CAMERA_POSE.name}
 
 
+_WITHOUT_POSES = (
+    "record the camera's poses, too, as PoseStamped or /tf; without poses, save images and K of single views, "
+    "and run active6d estimate --rgb FILE --depth FILE --intrinsics FILE (docs/bags.md)"
+)
+
 #: Settings of ``camera_adapter``, which texts for both name, and the options that do the same for a recording.
 _OPTIONS = {
     "set depth_info_topic and depth_to_color": "name --topics depth_info=NAME, with /tf_static in the recording",
@@ -209,8 +214,8 @@ def _choose(
             "info": "camera_info",
             "pose": "camera poses or /tf",
         }
-        there = _contents(source)
-        raise BagError(f"{source.path}: no {kinds[key]} in it; it holds {there}")
+        hint = f"; {_WITHOUT_POSES}" if key == "pose" else ""
+        raise BagError(f"{source.path}: no {kinds[key]} in it; it holds {_contents(source)}{hint}")
     usual = [each for each in candidates if each.topic.lstrip("/") == _NAMES.get(key)]
     for group in (candidates, usual, [each for each in candidates if prefer(each)]):
         if len(group) == 1:

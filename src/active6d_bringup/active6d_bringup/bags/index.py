@@ -12,7 +12,16 @@ from active6d_bringup.bags.camera_topics import CameraOptions
 from active6d_bringup.bags.mcap_file import McapFile, RecordedMessage
 from active6d_bringup.bags.recorded_camera import import_camera
 from active6d_bringup.bags.source import BagError, damaged, refuse_unfinished
-from active6d_bringup.bags.writer import ACTIVE6D, CHECKSUM, INFORMATION, SETTINGS, TYPESTORE, file_number, stamp_of
+from active6d_bringup.bags.writer import (
+    ACTIVE6D,
+    CHECKSUM,
+    INFORMATION,
+    SETTINGS,
+    TYPESTORE,
+    file_number,
+    parse_settings,
+    stamp_of,
+)
 from active6d_core.calibration import Calibration
 from active6d_core.ros.conversions import COLOR_ENCODINGS
 from active6d_core.ros.topics import (
@@ -25,7 +34,7 @@ from active6d_core.ros.topics import (
     DIAGNOSTICS,
     TOPICS,
 )
-from active6d_core.structured_text import parse_json, read_yaml
+from active6d_core.structured_text import read_yaml
 
 _POSE_ENDING = f"/{CAMERA_POSE.name}"
 _ENDINGS = tuple("/" + topic.name.lstrip("/") for topic in CONTRACT)
@@ -149,7 +158,7 @@ def _read_own(path: Path) -> tuple[BagIndex | None, tuple[str, ...]]:
         repeated |= TOPICS[topic] in CAMERA_TOPICS and known is not None and known != message.payload
         payloads[topic][stamp] = message.payload
         received[topic][stamp] = message.received
-    recording = dict(payloads), dict(received), diagnostics, _parse_settings(settings)
+    recording = dict(payloads), dict(received), diagnostics, parse_settings(settings)
     index = BagIndex(path, *recording, tuple(damage), _incomplete(payloads))
     # Of a damaged bag of this project, what is whole is read. Another camera's messages must be those of the contract.
     usable = (own and bool(damage)) or (not repeated and _is_of_the_contract(index))
@@ -275,14 +284,3 @@ def topic_names(recorded: set[tuple[str, str]], folder: Path) -> dict[str, str] 
         if topic in known and message_type != known[topic].type:
             raise BagError(f"{folder}: {topic} holds {message_type}, expected {known[topic].type}")
     return {name: topic.name for name, topic in known.items()}
-
-
-def _parse_settings(text: str | None) -> dict[str, dict[str, Any]]:
-    """Parameters of the nodes when recording; nothing where the bag does not have them."""
-    try:
-        settings = parse_json(text or "{}")
-    except (TypeError, ValueError):
-        return {}
-    if not isinstance(settings, dict):
-        return {}
-    return {node: parameters for node, parameters in settings.items() if isinstance(parameters, dict)}

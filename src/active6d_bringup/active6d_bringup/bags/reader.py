@@ -200,9 +200,11 @@ def _episode(
     truth = within(GROUND_TRUTH.name)
     begun = [EpisodeStart.from_message(message) for message in within(EPISODE_START.name)]
     ended = [EpisodeEnd.from_message(message) for message in within(EPISODE_END.name)]
+    # The recording of a replayed foreign bag has no episode/start that names the object.
+    named = index.settings.get("pose_estimator", {}).get("object")
     return EpisodeRecord(
         folder=index.folder,
-        info=episode_info(begun, ended),
+        info=({"object": str(named)} if named else {}) | episode_info(begun, ended),
         steps=[_step(messages, latencies.get(view, {}), view, world) for view in views if start <= view < limit],
         ground_truth=poses_from_array(truth[-1], world) if truth else None,
         end_reason=ended[-1].reason if ended else None,

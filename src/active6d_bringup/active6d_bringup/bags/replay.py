@@ -1,5 +1,6 @@
 """A recorded episode's camera through live perception, and whether what comes out equals what was recorded."""
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,10 +13,10 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from active6d_bringup.bags.camera_topics import CameraOptions
-from active6d_bringup.bags.index import read_bag
+from active6d_bringup.bags.index import BagIndex, read_bag
 from active6d_bringup.bags.reader import read_episodes
 from active6d_bringup.bags.source import BagError
-from active6d_bringup.bags.writer import TYPESTORE, stamp_of
+from active6d_bringup.bags.writer import TYPESTORE, refuse_existing, stamp_of
 from active6d_bringup.graph.composition import (
     GraphDescription,
     OnEvent,
@@ -23,9 +24,11 @@ from active6d_bringup.graph.composition import (
 )
 from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted, interruptible, make_graph
 from active6d_bringup.graph.params_file import default_params_file
-from active6d_core.ros.conversions import own_statuses, read_table, status_values
+from active6d_core.camera import View
+from active6d_core.hypotheses import SceneObjects
+from active6d_core.ros.conversions import objects_from_cloud, own_statuses, read_table, status_values
 from active6d_core.ros.node import qos_of
-from active6d_core.ros.topics import DIAGNOSTICS, PERCEPTION_TOPICS, Topic
+from active6d_core.ros.topics import DIAGNOSTICS, HYPOTHESES, OBJECTS, PERCEPTION_TOPICS, Topic
 
 #: What perception makes of a view, by topic name.
 COMPARED = {topic.name: topic for topic in PERCEPTION_TOPICS}
@@ -46,6 +49,7 @@ class ReplaySettings:
         camera: what the user says of the camera of a foreign recording.
         domain: ROS domain, see ``GraphDescription``.
         patience: seconds without an answer after which the replay counts as stuck.
+        record: folder to create for a recording of the replay, None for no recording.
     """
 
     bag: Path
@@ -58,6 +62,53 @@ class ReplaySettings:
     camera: CameraOptions = CameraOptions()
     domain: int | None = None
     patience: float = 120.0
+    record: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayStep:
+    """What perception made of one view.
+
+    Attributes:
+        index: from 0.
+        stamp: nanoseconds.
+        T_world_camera: (4, 4), recorded.
+        hypotheses: how many the estimator had for this view alone.
+        objects: everything accumulated up to this view, in the frame ``ReplayResult.world_frame``.
+    """
+
+    index: int
+    stamp: int
+    T_world_camera: np.ndarray
+    hypotheses: int
+    objects: SceneObjects
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedReplay:
+    """A bag that can be replayed, and the graph that will do it.
+
+    Attributes:
+        settings: what to replay.
+        index: of the bag.
+        views: of all its episodes.
+        description: of the graph.
+    """
+
+    settings: ReplaySettings
+    index: BagIndex
+    views: list[View]
+    description: GraphDescription
+
+    @property
+    def object(self) -> str:
+        """Name of the object."""
+        return str(self.description.nodes["hypothesis_fusion"]["object"])
+
+    @property
+    def stamps(self) -> list[int]:
+        """Of the views, in order."""
+        return [view.stamp for view in self.views]
 
 
 @dataclass(frozen=True)
@@ -93,6 +144,9 @@ class ReplayResult:
         seconds: of wall-clock time from the first view to the last objects.
         left_out: reason to the number of views that were not replayed.
         notes: what is doubtful in the recording, in words.
+        object: name of the object.
+        world_frame: of the objects' poses.
+        steps: one per view, in order.
     """
 
     views: int
@@ -100,6 +154,9 @@ class ReplayResult:
     seconds: float
     left_out: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    object: str = ""
+    world_frame: str = ""
+    steps: list[ReplayStep] = field(default_factory=list)
 
     @property
     def equal(self) -> bool:
@@ -121,52 +178,90 @@ def replay(
     on_view: Callable[[int, int], None] = lambda done, total: None,
     on_event: OnEvent = lambda text: None,
 ) -> ReplayResult:
-    """Send a bag's camera through live perception and compare.
+    """Send a bag's camera through live perception and compare: ``prepare``, then ``play``."""
+    return play(prepare(settings, on_event), on_view, on_event)
+
+
+def prepare(settings: ReplaySettings, on_event: OnEvent = lambda text: None) -> PreparedReplay:
+    """Read a bag and check that it can be replayed; no node is started.
 
     Args:
         settings: what to replay.
-        on_view: called with the number of views answered so far, and of all.
-        on_event: called with what happens to the nodes, in words.
+        on_event: called with what is damaged in the bag, in words.
 
     Raises:
         BagError: the bag cannot be read, or does not name its object.
-        ValueError: a setting or a parameter is wrong; the message names it.
-        EpisodeError: perception does not answer.
-        EpisodeInterrupted: by Ctrl-C or SIGTERM.
+        ValueError: a setting is wrong, or the folder to record into exists; the message names it.
     """
+    if settings.record is not None:
+        refuse_existing(settings.record)
     index = read_bag(settings.bag, settings.camera)
     for line in index.damage:
         on_event(f"{settings.bag}: {line}")
     episodes = read_episodes(index)
-    stamps = [step.stamp for episode in episodes for step in episode.steps]
     description = describe(settings, episodes[0].object, index.settings, index.frames)
     description.name_unused(on_event)
+    return PreparedReplay(settings, index, [step.view for each in episodes for step in each.steps], description)
+
+
+def play(
+    prepared: PreparedReplay,
+    on_view: Callable[[int, int], None] = lambda done, total: None,
+    on_event: OnEvent = lambda text: None,
+    on_step: Callable[[ReplayStep], None] = lambda step: None,
+) -> ReplayResult:
+    """Run a replay to its end.
+
+    Args:
+        prepared: what to replay.
+        on_view: called with the number of views answered so far, and of all.
+        on_event: called with what happens to the nodes, in words.
+        on_step: called with every view as soon as its objects are known.
+
+    Raises:
+        ValueError: a parameter is wrong; the message names it.
+        EpisodeError: perception does not answer.
+        EpisodeInterrupted: by Ctrl-C or SIGTERM.
+    """
+    settings, index, stamps, description = prepared.settings, prepared.index, prepared.stamps, prepared.description
+    world, steps, seconds = index.frames["world_frame"], list[ReplayStep](), 0.0
     with interruptible() as interrupted, running(make_graph(settings, description, on_event, interrupted)) as graph:
         listener = _Listener(graph.context, on_event)
         graph.add(listener)
         started = time.monotonic()
         graph.start()
-        answered, deadline, named = -1, 0.0, False
-        while len(listener.answered(stamps)) < len(stamps):
+        on_view(0, len(stamps))
+        named = description.name_others(listener, on_event)
+        deadline = time.monotonic() + settings.patience
+        while (answered := len(steps)) < len(stamps) or graph.missing(stamps[-1]):
             if interrupted.is_set():
                 raise EpisodeInterrupted
-            if answered != len(listener.answered(stamps)):
-                answered, deadline = len(listener.answered(stamps)), time.monotonic() + settings.patience
-                on_view(answered, len(stamps))
+            while len(steps) < len(stamps) and listener.has_answered(stamps[len(steps)]):
+                steps.append(listener.step(len(steps), prepared.views[len(steps)], world))
+                on_step(steps[-1])
+            if len(steps) > answered:
+                seconds, deadline = time.monotonic() - started, time.monotonic() + settings.patience
+                on_view(len(steps), len(stamps))
                 # Again with every view: nodes are not discovered at once.
                 named = named or description.name_others(listener, on_event)
             elif time.monotonic() > deadline:
-                silent = f"no objects of view {answered + 1} of {len(stamps)} in {settings.patience:.0f} s"
-                raise EpisodeError("; ".join([silent, *listener.causes.values()]))
+                raise EpisodeError("; ".join([_silence(prepared, answered), *listener.causes.values()]))
             graph.spin_once(0.1)
-        seconds = time.monotonic() - started
-        on_view(len(stamps), len(stamps))
     comparisons = [
         compare(stamp, topic, index.payloads.get(topic, {}).get(stamp), listener.payloads[topic, stamp])
         for stamp in stamps
         for topic in COMPARED
     ]
-    return ReplayResult(len(stamps), comparisons, seconds, index.left_out, index.notes)
+    rest = index.left_out, index.notes, prepared.object, world
+    return ReplayResult(len(stamps), comparisons, seconds, *rest, steps)
+
+
+def _silence(prepared: PreparedReplay, answered: int) -> str:
+    """Which view the replay waits for in vain, or that its recording is not complete."""
+    settings, total = prepared.settings, len(prepared.views)
+    if answered == total:
+        return f"{settings.record} is not complete after {settings.patience:.0f} s"
+    return f"no objects of view {answered + 1} of {total} in {settings.patience:.0f} s"
 
 
 def describe(
@@ -175,7 +270,7 @@ def describe(
     recorded: dict[str, dict[str, Any]],
     frames: dict[str, str],
 ) -> GraphDescription:
-    """The graph of a replay: a player in the camera's place, and perception with its recorded parameters.
+    """The graph of a replay: a player in the camera's place, perception with its recorded parameters, and a recorder.
 
     Raises:
         BagError: neither the settings nor the bag name the object.
@@ -186,12 +281,16 @@ def describe(
     estimator = {**recorded.get("pose_estimator", {}), "object": name}
     if settings.estimator is not None:
         estimator["estimator"] = settings.estimator
-    nodes = {
+    nodes: dict[str, dict[str, Any]] = {
         "bag_player": {"bag": str(settings.bag), "rate": float(settings.rate), **settings.camera.parameters},
         "pose_estimator": estimator,
         "hypothesis_fusion": {**recorded.get("hypothesis_fusion", {}), "object": name},
     }
+    if settings.record is not None:
+        nodes["episode_recorder"] = {"bag": str(settings.record)}
     nodes = {name: {**frames, **parameters, **settings.overrides.get(name, {})} for name, parameters in nodes.items()}
+    if settings.record is not None:
+        nodes["episode_recorder"]["settings"] = json.dumps(nodes)
     return GraphDescription(nodes, settings.params_file or default_params_file(), domain=settings.domain)
 
 
@@ -256,6 +355,13 @@ class _Listener(Node):
                         self._reported.add(status.name)
                         self._on_event(text)
 
-    def answered(self, stamps: list[int]) -> list[int]:
-        """The views for which everything that is compared has arrived."""
-        return [stamp for stamp in stamps if all((topic, stamp) in self.payloads for topic in COMPARED)]
+    def has_answered(self, stamp: int) -> bool:
+        """Whether everything that is compared has arrived for a view."""
+        return all((topic, stamp) in self.payloads for topic in COMPARED)
+
+    def step(self, index: int, view: View, world_frame: str) -> ReplayStep:
+        """What perception made of a view that it has answered."""
+        hypotheses: Any = TYPESTORE.deserialize_cdr(self.payloads[HYPOTHESES.name, view.stamp], HYPOTHESES.type)
+        objects = TYPESTORE.deserialize_cdr(self.payloads[OBJECTS.name, view.stamp], OBJECTS.type)
+        count = hypotheses.width * hypotheses.height
+        return ReplayStep(index, view.stamp, view.T_world_camera, count, objects_from_cloud(objects, world_frame))

@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from active6d_bringup.bags.mcap_file import McapFile
 from active6d_core.files import write_file
 from active6d_core.ros.topics import CAMERA_POSE, CONTRACT, EPISODE_END, EPISODE_START, Per, Topic
+from active6d_core.structured_text import parse_json
 
 #: Definitions and hashes of every standard message type.
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
@@ -30,6 +31,27 @@ ACTIVE6D, CHECKSUM = "active6d", "metadata_crc32"
 
 class RecordingError(ValueError):
     """A recording cannot be made; the text names the folder and says what to do."""
+
+
+def refuse_existing(folder: Path) -> None:
+    """Refuse a folder for a new recording that is there.
+
+    Raises:
+        RecordingError: it is.
+    """
+    if folder.exists():
+        raise RecordingError(f"{folder} exists already; name a new folder for the bag or remove this one")
+
+
+def parse_settings(text: str | None) -> dict[str, dict[str, Any]]:
+    """Parameters of the nodes when recording; nothing where the bag does not have them."""
+    try:
+        settings = parse_json(text or "{}")
+    except (TypeError, ValueError):
+        return {}
+    if not isinstance(settings, dict):
+        return {}
+    return {node: parameters for node, parameters in settings.items() if isinstance(parameters, dict)}
 
 
 class EpisodeWriter:
@@ -51,14 +73,15 @@ class EpisodeWriter:
     def __init__(self, folder: Path, names: dict[str, str], settings: str = "{}", *, resume: bool = False) -> None:
         self.folder = folder
         self._names, self._settings = names, settings
+        self._replayed = "bag_player" in parse_settings(settings)
         self._topics = {topic.name: topic for topic in CONTRACT}
         self._stamps: dict[str, set[int]] = {topic.name: set() for topic in CONTRACT}
         self._files: list[dict[str, Any]] = []
         self._lock = RLock()
         self._writer: McapWriter
         self._stream: BinaryIO
-        if folder.exists() and not (resume and _was_killed(folder)):
-            raise RecordingError(f"{folder} exists already; name a new folder for the bag or remove this one")
+        if not (resume and _was_killed(folder)):
+            refuse_existing(folder)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             for path in sorted(folder.glob("*.mcap"), key=file_number):
@@ -149,20 +172,21 @@ class EpisodeWriter:
     def missing(self, stamp: int) -> list[str]:
         """Topics that the recording of the episode ending with the view at ``stamp`` (ns) still waits for.
 
-        A topic per view must have spoken at ``stamp``; one per move, at every view of the same episode before it.
+        A topic per view must have spoken at ``stamp``; one per move, at every view of the same episode before it. A
+        replay has no policy, and mostly no ``episode/start``.
         """
         start = max((begun for begun in self._stamps[EPISODE_START.name] if begun <= stamp), default=0)
         views = set().union(*(self._stamps[topic.name] for topic in CONTRACT if topic.per is Per.VIEW))
         before = {view for view in views if start <= view < stamp}
         required = {
             Per.VIEW: before | {stamp},
-            Per.MOVE: before,
+            Per.MOVE: set() if self._replayed else before,
             Per.EPISODE: set(),
             Per.WHENEVER: set(),
         }
         late = [topic.name for topic in CONTRACT if not required[topic.per] <= self._stamps[topic.name]]
-        ends = ((EPISODE_START.name, start), (EPISODE_END.name, stamp))
-        return late + [topic for topic, at in ends if at not in self._stamps[topic]]
+        ends = {EPISODE_END.name: stamp} if self._replayed else {EPISODE_START.name: start, EPISODE_END.name: stamp}
+        return late + [topic for topic, at in ends.items() if at not in self._stamps[topic]]
 
     def close(self) -> None:
         """Write the index and metadata.yaml; a second call does nothing.

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2
 
-from active6d_bringup.bags.writer import RecordingError
+from active6d_bringup.bags.writer import refuse_existing
 from active6d_bringup.graph.composition import (
     UNANSWERED,
     ComposedGraph,
@@ -213,8 +213,8 @@ def run_episode(
         EpisodeInterrupted: by Ctrl-C or SIGTERM.
     """
     # The recorder would find out too, but only after the other nodes' heavy start.
-    if settings.bag is not None and settings.bag.exists():
-        raise RecordingError(f"{settings.bag} exists already; name a new folder for the bag or remove this one")
+    if settings.bag is not None:
+        refuse_existing(settings.bag)
     events: list[str] = []
 
     def note(text: str) -> None:

@@ -37,15 +37,16 @@ def doctor(
     if not graph and (domain is not None or namespace):
         raise ValueError("--domain and --namespace need --graph")
     if graph:
-        from active6d_tools.graph_doctor import examine_graph
+        from active6d_tools.graph_doctor import examine_graph, verdict
 
         checks, subject = _collect(examine_graph(domain, namespace, seconds)), "graph"
+        well = verdict(checks)
     else:
-        checks, subject = _collect(examine()), "core path"
+        checks, subject, well = _collect(examine()), "core path", "The core path works."
     _print(checks)
     ok = works(checks)
     write_json(json_file, {"ok": ok, "checks": [asdict(check) for check in checks]})
-    _print_verdict(checks, subject)
+    _print_verdict(checks, subject, well)
     raise typer.Exit(0 if ok else 1)
 
 
@@ -75,9 +76,9 @@ def _print(checks: "list[Check]") -> None:
     console.print(table)
 
 
-def _print_verdict(checks: "list[Check]", subject: str) -> None:
+def _print_verdict(checks: "list[Check]", subject: str, well: str) -> None:
     missing = ", ".join(check.name for check in checks if check.needed and not check.ok)
     if missing:
         console.print(f"[red]The {subject} does not work: {escape(missing)}.[/red]")
     else:
-        console.print(f"[green]The {subject} works.[/green]")
+        console.print(escape(well), style="green" if well.startswith(f"The {subject} works") else "yellow")

@@ -1,5 +1,6 @@
 """``active6d replay``."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -18,10 +19,10 @@ from active6d_tools.cli.options import (
     parse_overrides,
 )
 from active6d_tools.cli.output import print_left_out, write_json
-from active6d_tools.cli.terminal import console, progress_bar
+from active6d_tools.cli.terminal import console, messages, progress_bar
 
 if TYPE_CHECKING:
-    from active6d_bringup.bags.replay import ReplayResult, ReplaySettings
+    from active6d_bringup.bags.replay import ReplayResult, ReplaySettings, ReplayStep
 
 
 def replay(
@@ -40,13 +41,18 @@ def replay(
     estimator: Annotated[
         str | None, typer.Option(help="Estimator to use instead of the recorded one: auto, {estimators}.")
     ] = None,
+    bag: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Record the replay to a bag in this new folder.")
+    ] = None,
     processes: Processes = False,
     params_file: ParamsFile = None,
     override: NodeParameters = None,
     imports: Imports = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Send the camera images of a bag through the perception nodes again.
+    """Send the camera images of a bag, also of another program, through the perception nodes.
+
+    Prints what was found after each view. With --bag, report and viewers can show it; --json has the poses.
 
     Example: [bold]active6d replay bags/mug --as-fast --compare[/bold]
     """
@@ -65,11 +71,14 @@ def replay(
         processes=processes,
         params_file=params_file,
         overrides=parse_overrides(override or []),
+        record=bag,
     )
     check_parameters(settings.overrides)
     result = _run(settings)
     console.print(f"{result.views} views in {result.seconds:.1f} s", highlight=False)
     print_left_out(result.left_out, result.notes)
+    if bag is not None:
+        console.print(f"recorded into {bag}; active6d report {bag} shows it", highlight=False, markup=False)
     if compare:
         _print_comparison(result)
     write_json(json_file, _summary(result))
@@ -78,24 +87,37 @@ def replay(
 
 
 def _run(settings: "ReplaySettings") -> "ReplayResult":
-    from active6d_bringup.bags.replay import replay as run_replay
+    """Run with one line per view and a progress bar; a failed replay gives one line and exit code 1."""
+    from active6d_bringup.bags.replay import play, prepare
     from active6d_bringup.graph.episode import EpisodeError, EpisodeInterrupted
     from active6d_bringup.graph.processes import ProcessError
 
+    with messages.status("reading the bag"):
+        prepared = prepare(settings, lambda text: typer.echo(text, err=True))
     with progress_bar() as progress:
-        task = progress.add_task("starting the nodes", total=None)
+        task = progress.add_task("starting the nodes", total=len(prepared.views))
         try:
-            return run_replay(
-                settings,
-                lambda done, total: progress.update(task, completed=done, total=total, description="replaying"),
+            return play(
+                prepared,
+                lambda done, total: progress.update(task, completed=done, description="replaying"),
                 lambda text: typer.echo(text, err=True),
+                lambda step: progress.console.print(_describe(step), highlight=False, markup=False),
             )
         except (EpisodeError, ProcessError) as error:
             failure, code = str(error), 1
         except EpisodeInterrupted:
-            failure, code = "interrupted", 130
+            kept = f"; {settings.record} holds what was recorded" if settings.record else ""
+            failure, code = "interrupted" + kept, 130
     typer.echo(f"active6d: {failure}", err=True)
     raise typer.Exit(code)
+
+
+def _describe(step: "ReplayStep") -> str:
+    from active6d_perception.scene.fusion_parameters import FusionParameters
+
+    confirmed = int((step.objects.probability >= FusionParameters.confirmed).sum())
+    counts = f"hypotheses {step.hypotheses:2d}  objects {len(step.objects):2d}  confirmed {confirmed:2d}"
+    return f"view {step.index:2d}  {counts}"
 
 
 def _print_comparison(result: "ReplayResult") -> None:
@@ -114,6 +136,19 @@ def _print_comparison(result: "ReplayResult") -> None:
 
 def _summary(result: "ReplayResult") -> dict[str, Any]:
     return {
+        "object": result.object,
+        "world_frame": result.world_frame,
+        "steps": [
+            {
+                "stamp": step.stamp,
+                "T_world_camera": step.T_world_camera.tolist(),
+                "hypotheses": step.hypotheses,
+                "T_world_object": step.objects.T_world_object.tolist(),
+                "verification": step.objects.verification.tolist(),
+                "probability": step.objects.probability.tolist(),
+            }
+            for step in result.steps
+        ],
         "views": result.views,
         "seconds": result.seconds,
         "equal": result.equal,

@@ -76,14 +76,19 @@ def print_summary(analysis: "EpisodeAnalysis") -> None:
         scored = [f"{truth.detected.sum()}/{len(truth.detected)}", f"{truth.mean_e_add_mm:.1f} mm"] if truth else []
         camera = f"{step.azimuth:.0f}° {step.elevation:2.0f}°"
         confirmed = f"{len(step.confirmed)}, {step.wrong} wrong" if step.wrong else len(step.confirmed)
-        counts = step.hypothesis_count, len(step.rows), confirmed
+        counts = (step.hypothesis_count, len(step.rows), confirmed) if not analysis.without_results else "---"
         rows.append([str(step.number), camera, f"{step.moved_m:.2f} m", *map(str, counts), attended, *scored])
     print_table(columns, rows, title=f"[bold]{escape(title)}[/bold]")
     found = f"{len(last.rows)} objects"
     if last.truth:
         found = f"found {last.truth.detected.sum()} of {len(last.truth.detected)} objects, "
         found += f"mean ADD {last.truth.mean_e_add_mm:.1f} mm"
+    if analysis.without_results:
+        found = "no hypotheses and no objects in the recording"
     console.print(f"{found}, {analysis.distance_m:.2f} m in {len(analysis.steps) - 1} moves", highlight=False)
+    if analysis.without_results:
+        first = "nothing was estimated yet; run first:"
+        console.print(f"{first} {analysis.replay_command}", highlight=False, markup=False, soft_wrap=True)
     times = ", ".join(f"{time.node} {time.median_ms:.1f} ms" for time in analysis.node_times)
     if times:
         console.print(f"median per view: {times}", style="dim", highlight=False, markup=False)

@@ -119,6 +119,17 @@ class EpisodeAnalysis:
         return self.steps[-1].total_m
 
     @property
+    def without_results(self) -> bool:
+        """Whether the bag holds images only: neither hypotheses nor objects of any view."""
+        return all(step.record.hypotheses is None and step.record.objects is None for step in self.steps)
+
+    @property
+    def replay_command(self) -> str:
+        """The command that records what perception makes of the bag's images."""
+        folder = self.record.folder
+        return f"active6d replay {folder} --object {self.model.name} --as-fast --bag {folder.stem}_replayed"
+
+    @property
     def threshold_mm(self) -> float:
         """An object is detected below this ADD."""
         return 1e3 * DETECTION_FRACTION * self.model.diameter
