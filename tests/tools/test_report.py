@@ -15,6 +15,7 @@ from recorded_mugs import CAMERA, OFFSETS, make_record
 
 from active6d_bringup.bags.reader import EpisodeRecord, RecordedStep
 from active6d_core.camera import PinholeCamera
+from active6d_core.hypotheses import SceneObjects
 from active6d_core.object_model import ObjectModel, Symmetry
 from active6d_core.se3 import invert, make_transform
 from active6d_tools.cli.report import print_summary
@@ -203,7 +204,7 @@ def test_page_carries_the_path():
 
 def test_page_without_truth_objects_or_diagnostics():
     record = make_record(truth=False)
-    bare = [RecordedStep(step.view) for step in record.steps[:1]]
+    bare = [RecordedStep(step.view, objects=SceneObjects.empty()) for step in record.steps[:1]]
     page = Page(render_html(analyse(EpisodeRecord(record.folder, record.info, bare, None, None, "world"))))
     assert "no ground truth" in page.text
     assert "the recording ended before the episode" in page.text
