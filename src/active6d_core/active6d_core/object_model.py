@@ -17,14 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from active6d_core.mesh_file import check_diameter, close_mesh, load_mesh
 from active6d_core.nearest_name import did_you_mean
+from active6d_core.rotation_group import LARGEST_GROUP, rotation_group
 from active6d_core.structured_text import read_yaml
 
 SHIPPED_OBJECTS = Path(__file__).parent / "objects"
 _REQUIRED = {"name", "instances", "color"}
 _OPTIONAL = {"mesh", "profile", "scale", "symmetry", "features", "source"}
-_LARGEST_GROUP = 120
-#: Coordinates of rotations that count as the same; data sets round theirs.
-_SAME_ROTATION = 1e-3
 #: If set, a description may name a mesh outside of its own folder.
 ALLOW_OUTSIDE_VARIABLE = "ACTIVE6D_ALLOW_OUTSIDE"
 _MOST_INSTANCES, _MOST_PROFILE_ROWS, _MOST_FEATURES = 200, 1000, 100
@@ -302,23 +300,10 @@ def _read_symmetry(description: dict[str, Any]) -> Symmetry:
             raise ValueError("symmetry.axis needs three numbers, not all zero")
         axis = axis / np.linalg.norm(axis)
     rotation_vectors = np.array(description.get("discrete_rotvec_degrees") or np.zeros((0, 3)), float).reshape(-1, 3)
-    if len(rotation_vectors) > _LARGEST_GROUP or not np.isfinite(rotation_vectors).all():
-        raise ValueError(f"symmetry.discrete_rotvec_degrees needs at most {_LARGEST_GROUP} rows of finite numbers")
-    return Symmetry(axis, _generate_group(Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix()))
-
-
-def _generate_group(generators: np.ndarray) -> np.ndarray:
-    """(s, 3, 3) all products of (g, 3, 3) generators, the identity first.
-
-    The group must be complete. Otherwise an error would depend on which of two symmetric poses is the true one.
-    """
-    group = np.eye(3)[None]
-    while True:
-        products = np.concatenate([group, (generators[:, None] @ group).reshape(-1, 3, 3)])
-        distance = np.abs(products[:, None] - products).max(axis=(2, 3))
-        is_new = ~(np.tril(distance < _SAME_ROTATION, k=-1)).any(axis=1)
-        if is_new.sum() == len(group):
-            return group
-        group = products[is_new]
-        if len(group) > _LARGEST_GROUP:
-            raise ValueError("symmetry.discrete_rotvec_degrees does not generate a finite group; check the angles")
+    if len(rotation_vectors) > LARGEST_GROUP or not np.isfinite(rotation_vectors).all():
+        raise ValueError(f"symmetry.discrete_rotvec_degrees needs at most {LARGEST_GROUP} rows of finite numbers")
+    try:
+        group = rotation_group(Rotation.from_rotvec(np.radians(rotation_vectors)).as_matrix())
+    except ValueError as error:
+        raise ValueError(f"symmetry.discrete_rotvec_degrees: {error}; check the angles") from error
+    return Symmetry(axis, group)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from active6d_core.object_model import ObjectModel
+    from active6d_perception.model.exact_symmetry import Turn
     from active6d_sim.datasets.bop_models import ModelSymmetry
 
 #: Share of the diameter by which a symmetry may move the centroid.
@@ -91,6 +92,14 @@ def add(
     axis: Annotated[
         tuple[float, float, float] | None, typer.Option(help="Axis of a continuous symmetry in the mesh frame.")
     ] = None,
+    symmetry: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="AXIS:FOLD",
+            help="Part of a turn after which it looks the same, such as z:6 for a sixth of a turn about z; AXIS is x, "
+            "y, z or three numbers with commas. Repeatable; all products of the turns are written.",
+        ),
+    ] = None,
     instances: Annotated[tuple[int, int], typer.Option(help="Fewest and most instances in a scene.")] = (8, 14),
     color: Annotated[tuple[float, float, float], typer.Option(help="RGB, each from 0 to 1.")] = (0.6, 0.6, 0.62),
     into: Annotated[Path, typer.Option(metavar="DIR", help="Folder of description and mesh.")] = Path("objects"),
@@ -98,11 +107,14 @@ def add(
     """Add an object: copy its mesh and write its description file.
 
     Example: [bold]active6d object add bracket.stl --name bracket --scale 0.001 --into objects[/bold]
+
+    A hexagonal nut: [bold]active6d object add nut.stl --name nut --scale 0.001 --symmetry z:6 --symmetry x:2[/bold]
     """
     import yaml
 
-    from active6d_core.mesh_file import close_mesh, load_mesh, mesh_notes, open_edges
+    from active6d_core.mesh_file import mesh_notes
     from active6d_sim.datasets.bop_models import symmetry_beside
+    from active6d_tools.symmetry_check import parse_turn, rotation_vectors, symmetry_notes
 
     if not name.replace("_", "").replace("-", "").isalnum():
         raise ValueError(f"--name '{name}': use letters, digits, - and _")
@@ -113,55 +125,56 @@ def add(
         if path.exists():
             raise ValueError(f"{path} exists already; choose another --name or remove it")
     description = {"name": name, "mesh": f"meshes/{mesh_path.name}", "scale": scale}
-    notes = mesh_notes(mesh)
-    known = symmetry_beside(mesh) if axis is None else None
-    if axis is not None:
-        description["symmetry"] = {"axis": list(axis)}
-    elif known is not None:
-        description["symmetry"] = known.description
+    notes, turns = mesh_notes(mesh), [parse_turn(text) for text in symmetry or []]
+    declared: dict[str, Any] = {} if axis is None else {"axis": list(axis)}
+    declared |= {"discrete_rotvec_degrees": rotation_vectors(turns)} if turns else {}
+    known = None if declared else symmetry_beside(mesh)
+    if declared or known is not None:
+        description["symmetry"] = declared if known is None else known.description
     description |= {"instances": list(instances), "color": list(color), "source": mesh.name}
-    text = yaml.safe_dump(description, sort_keys=False)
+    text = yaml.safe_dump(description, sort_keys=False, default_flow_style=None)
     # Makers of data sets choose symmetries by rules of their own.
-    model = _store(mesh, mesh_path, description_path, text, check_axis=axis is not None)
+    model = _store(mesh, mesh_path, description_path, text, axis is not None, turns)
+    notes += [*_mesh_notes(mesh), *symmetry_notes(model)]
+    for note in notes + ([] if known is None else _data_set_notes(known, model, scale)):
+        console.print(note, highlight=False, markup=False, soft_wrap=True)
+    _print_added(model, into)
+
+
+def _mesh_notes(mesh: Path) -> list[str]:
+    """What is repaired of a mesh file each time it is loaded, and what stays open."""
+    from active6d_core.mesh_file import close_mesh, load_mesh, open_edges
+
     loaded = load_mesh(mesh)
-    notes += [f"repaired each time it is loaded: {repair}" for repair in close_mesh(loaded)]
+    notes = [f"repaired each time it is loaded: {repair}" for repair in close_mesh(loaded)]
     if (edges := open_edges(loaded)) > 0:
         notes.append(
             f"the mesh is open at {edges} edges and is used as it is; close it in a mesh editor, such as MeshLab"
         )
-    if model.symmetry.axis is None:
-        notes += _axis_notes(model)
-    for note in notes + ([] if known is None else _symmetry_notes(known, model, scale)):
-        console.print(note, highlight=False, markup=False)
-    _print_added(model, into)
+    return notes
 
 
 def _print_added(model: "ObjectModel", into: Path) -> None:
     """What a user needs to go on with a new object: its measures, its frame and where it is found."""
     import os
 
+    from active6d_tools.image_size import size_note
+
     size = " x ".join(f"{1e3 * extent:.1f}" for extent in model.mesh.extents)
     origin = " ".join(f"{1e3 * value:.2f}" for value in model.origin)
     for line in (
         f"added {model.name}: {1e3 * model.diameter:.1f} mm in diameter ({size} mm)",
         f"origin_mm {origin}: the object frame's origin, its centroid, in the mesh file's frame",
+        size_note(model),
     ):
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     folders = os.environ.get("ACTIVE6D_OBJECT_PATH", "").split(os.pathsep)
     if str(into) not in folders and str(into.resolve()) not in folders:
         command = f"export ACTIVE6D_OBJECT_PATH={into.resolve()}"
         console.print(f"to use it: {command}", highlight=False, markup=False, soft_wrap=True)
 
 
-def _axis_notes(model: "ObjectModel") -> list[str]:
-    """That an object without an axis of symmetry looks as if it had one."""
-    from active6d_tools.axis_check import axes_of_symmetry
-
-    fits = axes_of_symmetry(model)
-    return [f"it looks round about {' and '.join(fits)}; if turns about it do not matter, add --axis"] if fits else []
-
-
-def _symmetry_notes(known: "ModelSymmetry", model: "ObjectModel", scale: float) -> list[str]:
+def _data_set_notes(known: "ModelSymmetry", model: "ObjectModel", scale: float) -> list[str]:
     """What a user should know of symmetries that a data set names."""
     from active6d_sim.datasets.bop_models import INFO_FILE
 
@@ -174,10 +187,12 @@ def _symmetry_notes(known: "ModelSymmetry", model: "ObjectModel", scale: float) 
     return notes
 
 
-def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str, check_axis: bool) -> "ObjectModel":
+def _store(
+    mesh: Path, mesh_path: Path, description_path: Path, description: str, check_axis: bool, turns: "list[Turn]"
+) -> "ObjectModel":
     """Copy the mesh, write the description and read the object; nothing is left where that fails."""
     from active6d_core.object_model import read_description
-    from active6d_tools.axis_check import refuse_wrong_axis
+    from active6d_tools.symmetry_check import refuse_wrong_axis, refuse_wrong_turns
 
     mesh_path.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(mesh, mesh_path)
@@ -186,6 +201,8 @@ def _store(mesh: Path, mesh_path: Path, description_path: Path, description: str
         model = read_description(description_path)
         if check_axis:
             refuse_wrong_axis(model)
+        if turns:
+            refuse_wrong_turns(model, turns)
         return model
     except Exception as error:  # readers of meshes raise many kinds on damaged files
         description_path.unlink(missing_ok=True)
