@@ -240,7 +240,7 @@ def test_an_object_that_looks_round_is_said_to(tmp_path, add_bolt, monkeypatch):
     added = add_bolt()
     words = " ".join(added.stdout.split())
     assert "it looks the same after a sixth of a turn about x; if this does not matter, " in words
-    assert "add it again with --symmetry x:6" in words
+    assert "add it again with another --name and --symmetry x:6" in words
     assert "it looks nearly round about x (1 0 0); if no turn about it matters, add --axis" in words
     assert f"to use it: export ACTIVE6D_OBJECT_PATH={tmp_path / 'objects'}" in words
     monkeypatch.chdir(tmp_path)

@@ -131,7 +131,7 @@ def symmetry_notes(model: ObjectModel) -> list[str]:
         words += [f"{_PARTS.get(turn.fold, f'1/{turn.fold} of a')} turn about {_name(turn.axis)}" for turn in turns]
         notes.append(
             f"it looks the same after {' and '.join(words)}; if {'this does' if len(words) == 1 else 'these do'} not "
-            f"matter, add it again with {_options(axis, turns)}"
+            f"matter, add it again with another --name and {_options(axis, turns)}"
         )
     if found.axis is None and model.symmetry.axis is None and len(model.symmetry.discrete) == 1:
         fits = axes_of_symmetry(model)
