@@ -79,11 +79,11 @@ def plan_training(
     common: dict[str, Any] = {"steps": steps, "seed": seed}
     if policy == "view-attention":
         return _plan_dagger(folder, common, length, groups or {}, how)
-    from active6d_agent.policies.attention.ppo import AS_IN_PRACTICE, AS_IN_THE_PAPER, PRACTICAL_REWARD
-
     if policy == "attention-paper":
-        return _plan_ppo(folder, common | AS_IN_THE_PAPER, {}, length, groups or {}, how)
-    return _plan_ppo(folder, common | AS_IN_PRACTICE, PRACTICAL_REWARD, length, groups or {}, how)
+        from active6d_agent.policies.attention.ppo import AS_IN_THE_PAPER
+
+        common |= AS_IN_THE_PAPER
+    return _plan_ppo(folder, common, length, groups or {}, how)
 
 
 def _plan_dagger(
@@ -104,12 +104,7 @@ def _plan_dagger(
 
 
 def _plan_ppo(
-    folder: Path,
-    common: dict[str, Any],
-    rewarded: dict[str, Any],
-    length: int | None,
-    groups: dict[str, Any],
-    how: dict[str, bool],
+    folder: Path, common: dict[str, Any], length: int | None, groups: dict[str, Any], how: dict[str, bool]
 ) -> PolicyTraining:
     from active6d_agent.environment.episodes import RewardParameters
     from active6d_agent.policies.attention.ppo import PpoParameters, train_ppo
@@ -120,7 +115,7 @@ def _plan_ppo(
     if "rollout" not in training:
         own["rollout"] = 4 * training.get("steps", common["steps"])
     parameters = _make(PpoParameters, "training", {**common, **own}, groups)
-    reward = _make(RewardParameters, "reward", rewarded, groups)
+    reward = _make(RewardParameters, "reward", {}, groups)
     _refuse_others(groups, ("training", "reward"))
     return PolicyTraining(
         folder,

@@ -19,9 +19,7 @@ def policy(
     name: Annotated[
         str,
         typer.Option(
-            "--policy",
-            help=f"Policy to train: {LEARNED[0]}, {LEARNED[1]} (the paper's network, rewarded for all objects) or "
-            f"{PAPER} (to the letter, 10 times as long).",
+            "--policy", help=f"Policy to train: {LEARNED[0]}, {LEARNED[1]} (the paper's) or {PAPER} (10 times as long)."
         ),
     ] = LEARNED[0],
     steps: Annotated[int, typer.Option(min=1, help="Horizon T in moves.")] = 5,

@@ -32,9 +32,6 @@ from active6d_core.files import Checkpoints, append_line, atomic_file, write_fil
 
 #: The paper's length of the training and its learning rate (supplement E); batch and discount are the usual ones here.
 AS_IN_THE_PAPER = {"total": 10_000_000, "learning_rate": 1e-4, "evaluate_every": 200_000}
-#: How ``attention`` is trained and rewarded instead, because the paper's reward hardly ever pays with fusion of all
-#: views (``docs/policies.md``).
-AS_IN_PRACTICE, PRACTICAL_REWARD = {"normalise": True}, {"every_object": True}
 
 
 @dataclass(frozen=True)
