@@ -42,7 +42,8 @@ def print_table(
     """Print a table without lines; without names of columns it has no header.
 
     Cells of the first ``left`` columns are plain text to the left. The other cells may have rich's markup and are to
-    the right. These and the first column are never cut: where the terminal is too narrow, lines are longer than it.
+    the right. Nothing is cut. Text is folded. Where the terminal is too narrow for the first column and for those to
+    the right, lines are longer than it.
     """
     rows = [(*map(escape, row[:left]), *row[left:]) for row in rows]
     table = Table(
@@ -53,7 +54,7 @@ def print_table(
         whole = number == 0 or number >= left
         words = [*column.split(), *(row[number] for row in rows if number < len(row))]
         width = max((Text.from_markup(word).cell_len for word in words), default=None) if whole else None
-        table.add_column(column, justify=justify, header_style="dim", min_width=width)
+        table.add_column(column, justify=justify, header_style="dim", min_width=width, overflow="fold")
     for row in rows:
         table.add_row(*row)
     least = sum((column.min_width or 0) + 1 for column in table.columns)
