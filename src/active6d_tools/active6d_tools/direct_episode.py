@@ -125,13 +125,13 @@ class DirectRunner:
             objects = fusion.objects(view.stamp, shown, view.camera)
             episode.views.append(seen)
             episode.objects.append(objects)
-            episode.T_world_cameras = fusion.cameras.T_world_cameras()
             state.add_view(view.stamp, view.T_world_camera[:3, 3])
             unexplained = surface.unexplained(objects.T_world_object, fusion.cameras.T_world_anchor)
             reached = None
             while reached is None:
                 decision, episode.reason = state.decide(policy, objects, unexplained)
                 if decision is None or episode.reason:
+                    episode.T_world_cameras = fusion.cameras.T_world_cameras()
                     return episode
                 try:
                     reached = camera.go_to(self.limits.sphere.pose(decision.position))

@@ -29,6 +29,7 @@ from active6d_core.hypotheses import SceneObjects
 from active6d_core.ros.conversions import objects_from_cloud, own_statuses, read_table, status_values
 from active6d_core.ros.node import qos_of
 from active6d_core.ros.topics import DIAGNOSTICS, HYPOTHESES, OBJECTS, PERCEPTION_TOPICS, Topic
+from active6d_perception.scene.fusion_parameters import FusionParameters
 
 #: What perception makes of a view, by topic name.
 COMPARED = {topic.name: topic for topic in PERCEPTION_TOPICS}
@@ -104,6 +105,12 @@ class PreparedReplay:
     def object(self) -> str:
         """Name of the object."""
         return str(self.description.nodes["hypothesis_fusion"]["object"])
+
+    @property
+    def confirmed(self) -> float:
+        """Probability from which fusion counts an object, as when recording."""
+        parameters = self.description.nodes["hypothesis_fusion"]
+        return float(parameters.get("confirmed", FusionParameters.confirmed))
 
     @property
     def stamps(self) -> list[int]:

@@ -8,12 +8,12 @@ mesh's frame, those of inertia, and for half turns also across an axis that was 
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from active6d_core.object_model import ObjectModel
 from active6d_core.rotation_group import rotation_group
+from active6d_perception.model.model_views import ray_caster
 
 #: Share of the diameter by which a turned surface may leave the surface. For a hexagonal nut it is .04 after turns that
 #: are not multiples of a sixth, for a box whose sides differ by a twentieth .011 after a quarter.
@@ -68,8 +68,7 @@ class TurnedSurface:
 
     def __init__(self, model: ObjectModel) -> None:
         self._points = model.surface[0][:_POINTS].astype(np.float32)
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(np.asarray(model.mesh.vertices, np.float32), np.asarray(model.mesh.faces, np.uint32))
+        self._scene = ray_caster(model.mesh, threads=1)
 
     def distances(self, R: np.ndarray, count: int = _POINTS) -> np.ndarray:
         """(k, count) metres between the surface and ``count`` of its points, turned by (k, 3, 3) rotations."""

@@ -101,7 +101,7 @@ def _run(settings: "ReplaySettings") -> "ReplayResult":
                 prepared,
                 lambda done, total: progress.update(task, completed=done, description="replaying"),
                 lambda text: typer.echo(text, err=True),
-                lambda step: progress.console.print(_describe(step), highlight=False, markup=False),
+                lambda step: progress.console.print(_describe(step, prepared.confirmed), highlight=False, markup=False),
             )
         except (EpisodeError, ProcessError) as error:
             failure, code = str(error), 1
@@ -112,10 +112,10 @@ def _run(settings: "ReplaySettings") -> "ReplayResult":
     raise typer.Exit(code)
 
 
-def _describe(step: "ReplayStep") -> str:
-    from active6d_perception.scene.fusion_parameters import FusionParameters
+def _describe(step: "ReplayStep", confirmed_from: float) -> str:
+    from active6d_tools.report.analysis import count_confirmed
 
-    confirmed = int((step.objects.probability >= FusionParameters.confirmed).sum())
+    confirmed, _ = count_confirmed(step.objects, None, confirmed_from)
     counts = f"hypotheses {step.hypotheses:2d}  objects {len(step.objects):2d}  confirmed {confirmed:2d}"
     return f"view {step.index:2d}  {counts}"
 

@@ -15,10 +15,7 @@ from active6d_perception.scene.fusion_parameters import FusionParameters
 
 @dataclass(frozen=True)
 class ObjectRow:
-    """One accumulated object at one step; attention and error are None if they are unknown.
-
-    An object is ``confirmed`` by the threshold that the fusion node had when recording.
-    """
+    """One accumulated object at one step; attention and error are None if they are unknown."""
 
     index: int
     verification: float
@@ -30,7 +27,6 @@ class ObjectRow:
     attended: bool
     e_add_mm: float | None
     detected: bool
-    confirmed: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +43,7 @@ class StepAnalysis:
         elevation: degrees of the camera above the horizon.
         moved_m: metres of arc since the last view.
         total_m: metres of arc since the first view.
+        confirmed_from: probability from which an object is confirmed, as when recording.
     """
 
     number: int
@@ -58,6 +55,7 @@ class StepAnalysis:
     elevation: float
     moved_m: float
     total_m: float
+    confirmed_from: float
 
     @property
     def hypothesis_count(self) -> int:
@@ -67,12 +65,12 @@ class StepAnalysis:
     @property
     def confirmed(self) -> list[ObjectRow]:
         """The objects that are probable enough to count."""
-        return [row for row in self.rows if row.confirmed]
+        return [row for row in self.rows if row.probability >= self.confirmed_from]
 
     @property
     def wrong(self) -> int | None:
         """How many confirmed objects are no true object's detection, None without ground truth."""
-        return None if self.truth is None else sum(not row.detected for row in self.confirmed)
+        return count_confirmed(self.objects, self.truth, self.confirmed_from)[1]
 
     @property
     def attended(self) -> ObjectRow | None:
@@ -107,11 +105,6 @@ class EpisodeAnalysis:
     sphere: ViewSphere
     steps: list[StepAnalysis]
     node_times: list[NodeTime]
-
-    @property
-    def confirmed_from(self) -> float:
-        """The probability from which an object is confirmed."""
-        return _confirmed_from(self.record)
 
     @property
     def distance_m(self) -> float:
@@ -189,7 +182,7 @@ def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAna
     sphere = ViewSphere(radius=float(np.linalg.norm(positions, axis=1).mean()))
     moved = np.concatenate([[0.0], sphere.arc(positions[:-1], positions[1:])])
     azimuth, elevation = np.degrees(sphere.angles(positions)).T
-    steps = []
+    steps, confirmed_from = [], _confirmed_from(record)
     for number, step in enumerate(record.steps):
         objects = step.objects if step.objects is not None else SceneObjects.empty()
         score = evaluate_scene(model, objects.T_world_object, truth) if truth is not None and len(truth) else None
@@ -198,12 +191,13 @@ def analyse(record: EpisodeRecord, object_name: str | None = None) -> EpisodeAna
                 number=number,
                 record=step,
                 objects=objects,
-                rows=_rows(step, objects, score, _confirmed_from(record)),
+                rows=_rows(step, objects, score),
                 truth=score,
                 azimuth=float(azimuth[number] % 360.0),
                 elevation=float(elevation[number]),
                 moved_m=float(moved[number]),
                 total_m=float(moved[: number + 1].sum()),
+                confirmed_from=confirmed_from,
             )
         )
     return EpisodeAnalysis(model, record, sphere, steps, _node_times(record))
@@ -227,9 +221,7 @@ def count_confirmed(objects: SceneObjects, truth: SceneScore | None, confirmed_f
     return int(confirmed.sum()), int(confirmed.sum() - confirmed_and_right.sum())
 
 
-def _rows(
-    step: RecordedStep, objects: SceneObjects, truth: SceneScore | None, confirmed_from: float
-) -> list[ObjectRow]:
+def _rows(step: RecordedStep, objects: SceneObjects, truth: SceneScore | None) -> list[ObjectRow]:
     attention = step.attention if step.attention is not None and len(step.attention) == len(objects) else None
     errors, detected = {}, {}
     if truth is not None:
@@ -247,7 +239,6 @@ def _rows(
             attended=step.attended == i,
             e_add_mm=errors.get(i),
             detected=detected.get(i, False),
-            confirmed=bool(objects.probability[i] >= confirmed_from),
         )
         for i in range(len(objects))
     ]
